@@ -98,6 +98,8 @@ def diagnose(
     if data is None:
         return Diagnosis(tuple(findings))
     findings += _describe(data)
+    if not data.rig.cameras:
+        return Diagnosis(tuple(findings))
     findings += [Finding("error", line) for line in find_same_images(data, data.rig)]
     data = hide_burnt_in(data, data.rig)
     findings += [Finding("warning", line) for line in describe_burnt_in(data)]
@@ -147,6 +149,7 @@ def _load(
 def _describe(data: Dataset) -> Iterator[Finding]:
     """The content of the dataset, and whether there are enough frames."""
     counts = {"frame": (count := len(data.frames)), "camera": len(data.rig.cameras)}
+    counts |= {"LiDAR": len(data.rig.lidars)} if data.rig.lidars else {}
     words = (f"{number} {noun}{'' if number == 1 else 's'}" for noun, number in counts.items())
     yield Finding("note", ", ".join(words))
     yield from (Finding("note", note) for note in data.notes)

@@ -13,10 +13,13 @@ import logging
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+from scipy.linalg import block_diag
+
 from calibgraph.arrays import Array
 from calibgraph.elsewhere import go_on_elsewhere
 from calibgraph.io.clouds import describe_thinned
-from calibgraph.io.dataset import Dataset
+from calibgraph.io.dataset import Dataset, load_dataset
 from calibgraph.model.calibration import Calibration, Later
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.clock import odd_motions, unused_times
@@ -36,6 +39,7 @@ from calibgraph.trust.lens_checks import asks_offset
 from calibgraph.trust.observability import weaknesses
 from calibgraph.trust.probability import TABLES, judge, model_of
 from calibgraph.trust.solution_checks import residuals_of
+from calibgraph.vehicle.rig import LidarResult, calibrate_rig_lidars
 
 _log = logging.getLogger(__name__)
 
@@ -51,7 +55,9 @@ def calibrate(
     time_limit_s: float | None = None,
     progress: Progress | None = None,
 ) -> Calibration:
-    """Calibrate all cameras of a rig jointly from images and clouds.
+    """Calibrate all cameras of a rig jointly from images and clouds, and its LiDARs from clouds.
+
+    Of several LiDARs each is calibrated to the base, and cameras to the base alone.
 
     Args:
         dataset: a dataset, its folder, a KITTI odometry sequence, or several folders of one rig.
@@ -70,10 +76,25 @@ def calibrate(
         CorrespondenceError: if a camera gets too few correspondences.
         ValueError: if the matcher is unknown.
     """
-    report = progress or no_progress
+    report, watch = progress or no_progress, Stopwatch()
+    data = dataset if isinstance(dataset, Dataset) else load_dataset(dataset, rig)
+    rig, lidars = rig or data.rig, None
+    if rig.other_lidars:
+        with watch("lidars"):
+            lidars = calibrate_rig_lidars(data, rig, config or Config(), progress=report)
+    if lidars is not None and not rig.cameras:
+        with watch("hash_inputs"):
+            hashes = hash_inputs(data)
+        result = replace(
+            _without_cameras(rig, config or Config(), terms),
+            inputs=hashes,
+            frames=tuple(frame.entry() for frame in data.frames),
+            timings_s=watch.seconds,
+        )
+        return _with_lidars(result, lidars)
     with Threads(1) as beside:
         run = match_in_rounds(                                   # match -> solve_joint, in rounds
-            dataset, rig, matcher, config, terms=terms, time_limit_s=time_limit_s, progress=report
+            data, rig, matcher, config, terms=terms, time_limit_s=time_limit_s, progress=report
         )  # fmt: skip
         if asks_offset(run):
             beside.submit(registered_twists, run.dataset)  # which its checks wait for
@@ -89,14 +110,37 @@ def calibrate(
         _log.warning(line)
     report("done", 1, 1)
     table = run.correspondences
-    return replace(
+    result = replace(
         to_calibration(evidence, checks),
         correspondences=table.with_metadata({**table.metadata, **record}),
         frames=tuple(frame.entry() for frame in run.dataset.frames),
         rounds=run.rounds,
         warnings=(*run.warnings, *thinned),
         inputs=dict(run.hashes),
-        timings_s=run.watch.seconds,
+        timings_s={**watch.seconds, **run.watch.seconds},
+    )
+    return result if lidars is None else _with_lidars(result, lidars)
+
+
+def _without_cameras(rig: Rig, config: Config, terms: Terms) -> Calibration:
+    """The result of a rig without cameras, before its LiDARs."""
+    return Calibration(
+        rig=rig, initial_rig=rig, covariance={}, joint_covariance=np.empty((0, 0)),
+        camera_verdicts={}, residuals={}, counts={}, timings_s={}, terms=terms, config=config,
+    )  # fmt: skip
+
+
+def _with_lidars(result: Calibration, found: LidarResult) -> Calibration:
+    """The result with the LiDARs beside the cameras, of which they are independent."""
+    cameras, joint = result.joint_covariance, None
+    if cameras is not None:
+        joint = np.asarray(block_diag(cameras, found.poses.joint_covariance))
+    return replace(
+        result,
+        rig=result.rig.model_copy(update={"lidars": dict(found.lidars), "vehicle": found.vehicle}),
+        joint_covariance=joint,
+        lidar_verdicts=dict(found.verdicts),
+        warnings=(*result.warnings, *found.warnings),
     )
 
 

@@ -334,7 +334,7 @@ def refine_with_camera_pairs(run: MatchingRun) -> MatchingRun:
 def _open(dataset: Datasets, rig: Rig | None, most_frames: int | None) -> tuple[FrameChoice, Rig]:
     """The frames that the matcher is given, and the initial guess."""
     data = dataset if isinstance(dataset, Dataset) else load_dataset(dataset, rig)
-    guess = rig if rig is not None else data.rig
+    guess = (rig if rig is not None else data.rig).require_cameras()
     data = keep_frames(data)
     require_different_images(data, guess)
     data = keep_frames(hide_burnt_in(data, guess))

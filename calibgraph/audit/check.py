@@ -105,7 +105,7 @@ def check(
     """
     tolerance, report = tolerance_twist(tolerance_deg, tolerance_cm), progress or no_progress
     full, watch = find_matcher(matcher, seed=seed), Stopwatch()
-    loaded = rig if isinstance(rig, Rig) else load_rig(rig)
+    loaded = (rig if isinstance(rig, Rig) else load_rig(rig)).require_cameras()
     deployed = loaded.model_copy(update={"relative_poses": ()})
     given = dataset if isinstance(dataset, Dataset) else load_dataset(dataset, deployed)
     same_recording, verdict = (False, None) if isinstance(rig, Rig) else provenance(rig, given)

@@ -160,7 +160,7 @@ def drift(
         raise ValueError(
             f"days: expected {count} numbers up to {_LATEST_DAY:g}, one per result, found {days}"
         )
-    cameras = [*loaded[0].rig.cameras]
+    cameras = [*loaded[0].rig.require_cameras().cameras]
     limits = Limits(FALSE_ALARM_RATE / (2 * 6 * len(cameras) * (count + 1)), tolerance)
     found = {name: _deviations(loaded, name, limits) for name in cameras}
     judged = {name: _judge(opened, name, each, limits) for name, each in found.items()}

@@ -72,7 +72,7 @@ def calibrate(
         )  # fmt: skip
         result = _warned_of_same_data(result, rig)
         written = write_result(result, out, data)
-    checks = next(iter(result.camera_verdicts.values())).checks
+    checks = (check for of in result.camera_verdicts.values() for check in of.checks)
     copies = next((check.value for check in checks if check.name == "copies"), None)
     _print_frames_used(len(result.frames), data, int(copies or 0))
     _print_and_exit(result, written, as_json=as_json)

@@ -186,16 +186,23 @@ def frames_of_bag(
     cameras: Mapping[str, Camera],
     options: BagOptions,
     *,
+    lidars: Sequence[str] = (),
     start: int = 0,
     prefix: str = "",
 ) -> FoundFrames:
     """Pair the clouds of a bag with its images, without keeping any of them.
 
-    The first frame has the index ``start``; names are stamps behind the prefix.
+    Of several LiDARs, the base first, its clouds are paired with those of the others, too. The
+    first frame has the index ``start``; names are stamps behind the prefix.
     """
+    if lidars and options.motion != "none":
+        raise DatasetError(
+            f"{path}: clouds of several LiDARs are not corrected for motion; leave --motion out, "
+            "and choose frames in which the vehicle stands"
+        )
     bag = Bag(path)
-    topics = choose_topics(bag, options.topics, [*cameras])
-    images = {name: each.image for name, each in topics.cameras.items()}
+    topics = choose_topics(bag, options.topics, [*cameras], lidars=lidars)
+    images = topics.paired
     stamps, lenses = _read(bag, topics, options)
     clouds = stamps[topics.lidar]
     tolerance_ns = round(options.sync_tolerance_s * _S)
@@ -214,7 +221,8 @@ def frames_of_bag(
             start + int(row + cell),
             f"{prefix}{clouds.stamp_ns[row]}",
             clouds.paths[row],
-            {name: stamps[images[name]].paths[rows[row]] for name, rows in pairs.items()},
+            {name: stamps[images[name]].paths[pairs[name][row]] for name in cameras},
+            lidar_paths={n: stamps[t].paths[pairs[n][row]] for n, t in topics.lidars.items()},
         )
         for row, cell in zip(complete, cells, strict=True)
     )
@@ -239,7 +247,7 @@ def _read(
     bag: Bag, topics: RigTopics, options: BagOptions
 ) -> tuple[dict[str, TopicStamps], dict[str, LensStates]]:
     """The stamps of clouds and images by topic, and the lenses by camera."""
-    stamps = {t: TopicStamps() for t in (topics.lidar, *(c.image for c in topics.cameras.values()))}
+    stamps = {t: TopicStamps() for t in (topics.lidar, *topics.paired.values())}
     infos = {name: c for name, c in topics.cameras.items() if c.info and bag.has(c.info)}
     lenses = {
         name: LensStates(f"{bag.path}: {c.info}", rectified=c.rectified)
@@ -314,17 +322,18 @@ def _summary(
     """How many frames there are, how far apart their stamps are, and what was left out."""
     clouds = stamps[topics.lidar]
     parts = [
-        f"{len(clouds.paths)} clouds, {len(complete)} with all images within "
+        f"{len(clouds.paths)} clouds, {len(complete)} with all {_paired(topics)} within "
         f"{options.sync_tolerance_s:g} s"
     ]
     for name, rows in pairs.items():
-        images = stamps[topics.cameras[name].image]
+        images = stamps[topics.paired[name]]
         if len(complete):
             ahead_ms = after_ns(clouds, images, rows, complete) / 1e6
             most = np.abs(ahead_ms).max()
             parts.append(f"{name} {np.median(ahead_ms):+.0f} ms (median), at most {most:.0f}")
         if np.any(rows < 0):
-            parts.append(f"{np.sum(rows < 0)} without an image of {name}")
+            what = "a cloud" if name in topics.lidars else "an image"
+            parts.append(f"{np.sum(rows < 0)} without {what} of {name}")
     parts += [
         f"{topic}: {count} {what}"
         for topic, each in stamps.items()
@@ -333,19 +342,24 @@ def _summary(
     return "; ".join(parts)
 
 
+def _paired(topics: RigTopics) -> str:
+    kinds = ["images"] * bool(topics.cameras) + ["clouds of other LiDARs"] * bool(topics.lidars)
+    return " and ".join(kinds)
+
+
 def _advice(stamps: Mapping[str, TopicStamps], topics: RigTopics, pairs: Mapping[str, Rows]) -> str:
     """What to do if no frame is complete."""
     for topic in stamps:
         if not stamps[topic].paths:
             return f"{topic} has nothing to use; choose another topic"
     worst = min(pairs, key=lambda name: int(np.sum(pairs[name] >= 0)))
-    apart = offsets_of(stamps[topics.lidar], stamps[topics.cameras[worst].image])
+    apart = offsets_of(stamps[topics.lidar], stamps[topics.paired[worst]])
     if len(apart):
         return (
             f"the nearest images of {describe_offsets(worst, apart)}; set stamps: record in "
             "--config if the clocks differ, or a larger sync_tolerance_s if that is acceptable"
         )
-    both = {topic: stamps[topic] for topic in (topics.lidar, topics.cameras[worst].image)}
+    both = {topic: stamps[topic] for topic in (topics.lidar, topics.paired[worst])}
     return (
         f"the stamps of {describe_spans(both)} do not meet; set stamps: record in --config if "
         "the clocks differ, or a larger sync_tolerance_s"

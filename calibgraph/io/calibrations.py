@@ -58,9 +58,8 @@ def load_calibration(path: Path | str) -> Calibration:
         rig=checked_model(Rig, parts.rig, path),
         initial_rig=checked_model(Rig, parts.initial_rig, path),
         config=checked_model(Config, parts.config, path),
-        camera_verdicts={
-            k: Verdict(v.checks, v.error_probability) for k, v in parts.camera_verdicts.items()
-        },
+        camera_verdicts=_verdicts(parts.camera_verdicts),
+        lidar_verdicts=_verdicts(parts.lidar_verdicts),
         bootstrap=parts.bootstrap_covariance,
         lens_covariance={name: of.covariance for name, of in parts.lens_covariance.items()},
         frames=tuple(frame.model_dump(exclude_none=True) for frame in parts.frames_used),
@@ -146,6 +145,10 @@ class _Checks(BaseModel):
     error_probability: ErrorProbability | None = None
 
 
+def _verdicts(parts: Mapping[str, _Checks]) -> dict[str, Verdict]:
+    return {name: Verdict(of.checks, of.error_probability) for name, of in parts.items()}
+
+
 class _Parts(BaseModel):
     """The keys of a result's file that are read, with their types; the others repeat them."""
 
@@ -158,6 +161,7 @@ class _Parts(BaseModel):
     bootstrap_covariance: dict[str, Covariance]
     stage1_T_camera_lidar: dict[str, Matrix4]
     camera_verdicts: dict[str, _Checks]
+    lidar_verdicts: dict[str, _Checks] = {}
     residuals: dict[str, Residuals]
     weaknesses: dict[str, tuple[str, ...]]
     frames_used: tuple[_FrameEntry, ...]
@@ -184,8 +188,9 @@ def _require_consistent(
     verdict = content.get("verdict", {})
     status = verdict.get("status") if isinstance(verdict, dict) else verdict
     verdicts = [("the rig", status, found.verdict.status)] + [
-        (f"camera {name!r}", each.status, found.camera_verdicts[name].status)
-        for name, each in parts.camera_verdicts.items()
+        (f"{kind} {name!r}", each.status, found.verdicts[name].status)
+        for kind, of in (("camera", parts.camera_verdicts), ("LiDAR", parts.lidar_verdicts))
+        for name, each in of.items()
     ]
     for what, stated, derived in verdicts:
         if stated != derived:
@@ -202,8 +207,12 @@ def _require_consistent(
         covariance is None or _is_whole(content.get("sigmas"), name)
         for name, covariance in found.covariance.items()
     )
+    measured = {
+        name for name, lidar in (found.rig.lidars or {}).items() if lidar.covariance is not None
+    }
+    right["lidar_verdicts"] = measured == {*found.lidar_verdicts}
     right["initial_rig"] = names == {*found.initial_rig.cameras}
-    right["joint_covariance"] = joint is None or len(joint) == _POSE * len(names)
+    right["joint_covariance"] = joint is None or len(joint) == _POSE * len(found.joint_names)
     right["lens_covariance"] = all(
         [*of.parameters] == joint_parameters(found.lens.get(name, ()))
         and len(of.covariance) == len(of.parameters)
@@ -224,7 +233,14 @@ _OF_SOME_CAMERAS = (
     "residuals", "stage1_T_camera_lidar", "weaknesses", "prior_share", "bootstrap", "error_sources",
     "lens",
 )  # fmt: skip
-_OTHERWISE = {"rig", "initial_rig", "config", "camera_verdicts", "lens_covariance"}
+_OTHERWISE = {
+    "rig",
+    "initial_rig",
+    "config",
+    "camera_verdicts",
+    "lidar_verdicts",
+    "lens_covariance",
+}
 _PLAIN = {f.name for f in fields(Calibration)} & _Parts.model_fields.keys() - _OTHERWISE
 """The parts that are those of a calibration as they are."""
 

@@ -146,7 +146,8 @@ def load_dataset(
         prefix = f"{path.name}/" if len(data.folders) > 1 else ""
         start = 1 + max((frame.index for frame in recorded), default=-1)
         found = (
-            frames_of_bag(path, data.rig.cameras, bag, start=start, prefix=prefix) if is_bag(path)
+            frames_of_bag(path, data.rig.cameras, bag, lidars=data.rig.all_lidars, start=start,
+                          prefix=prefix) if is_bag(path)
             else _frames_of_files(path, data.rig, start, prefix, complete=frames is None,
                                   tolerance_s=bag.sync_tolerance_s, interval_s=interval_s)
         )  # fmt: skip
@@ -156,7 +157,7 @@ def load_dataset(
     others = () if recorded == chosen else tuple(recorded)
     data = replace(data, frames=tuple(chosen), recorded=others, notes=tuple(notes))
     data = data if frames is None else _complete(data.select(frames))
-    of_cloud = data.frames[0].describe_cloud() if data.frames else ()
+    of_cloud = data.frames[0].describe_cloud() if data.frames and data.rig.cameras else ()
     return replace(data, notes=(*of_cloud, *data.notes))
 
 
@@ -190,10 +191,17 @@ def _frames_of_files(
 ) -> FoundFrames:  # fmt: skip
     """The frames of a folder; the complete ones where names are stamps."""
     files, pairing = frames_of_folder(
-        path, [*rig.cameras], complete=complete, sync_tolerance_s=tolerance_s
+        path, [*rig.cameras], lidars=rig.all_lidars, complete=complete, sync_tolerance_s=tolerance_s
     )
     frames = tuple(
-        Frame(start + n, prefix + each.stem, each.cloud, each.images, columns=rig.cloud_columns)
+        Frame(
+            start + n,
+            prefix + each.stem,
+            each.cloud,
+            each.images,
+            columns=rig.cloud_columns,
+            lidar_paths=each.lidars,
+        )
         for n, each in enumerate(files)
         if not pairing or rig.cameras.keys() <= each.images.keys()
     )

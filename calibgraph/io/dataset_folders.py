@@ -34,26 +34,34 @@ from calibgraph.io.frame_files import (
 from calibgraph.io.images import IMAGE_SUFFIXES
 from calibgraph.io.nuscenes import nuscenes
 
+LIDARS = "lidars"
+"""Folder of the folders of several LiDARs, named as in the rig."""
 
-def folder_layout(folder: Path) -> tuple[Path, dict[str, Path]]:
+
+def folder_layout(folder: Path, lidar: str = "") -> tuple[Path, dict[str, Path]]:
     """The folders of clouds and of each camera's images; files of one frame have the same stem.
 
-    Of a KITTI odometry sequence, or of a dataset folder.
+    Of a KITTI odometry sequence, or of a dataset folder; of one with several LiDARs ``lidar`` is
+    the base.
     """
     if (folder / kitti.CALIBRATION_NAME).is_file():
         return folder / kitti.CLOUD_FOLDER, kitti.camera_folders(folder)
     cameras = sorted(path for path in (folder / "cameras").glob("*") if path.is_dir())
-    return folder / "lidar", {path.name: path for path in cameras}
+    clouds = folder / LIDARS / lidar if (folder / LIDARS).is_dir() else folder / "lidar"
+    return clouds, {path.name: path for path in cameras}
 
 
 def frames_of_folder(
-    folder: Path, cameras: Sequence[str], *, complete: bool = True, sync_tolerance_s: float = NEAR_S
-) -> tuple[list[FrameFiles], str]:
+    folder: Path, cameras: Sequence[str], *, lidars: Sequence[str] = (), complete: bool = True,
+    sync_tolerance_s: float = NEAR_S,
+) -> tuple[list[FrameFiles], str]:  # fmt: skip
     """The frames of a folder; where names are stamps, those with an image near enough.
 
     Args:
         folder: a dataset folder, a KITTI odometry sequence, or one of a published data set.
         cameras: the rig's.
+        lidars: the rig's if there are several, the base first; a frame has the clouds that have its
+            stem.
         complete: whether every cloud must have an image of every camera, and every image a cloud,
             where names are no stamps.
         sync_tolerance_s: largest difference of the stamps that name a cloud and its images.
@@ -69,8 +77,9 @@ def frames_of_folder(
             stems = ({f.stem for f in frames}, {f.stem for f in frames if name in f.images})
             _require_pairs(folder, name, *stems)
         return frames, ""
-    of_clouds, of_images = folder_layout(folder)
+    of_clouds, of_images = folder_layout(folder, *lidars[:1])
     clouds = files_by_stem(of_clouds, CLOUD_SUFFIXES)
+    others = {name: files_by_stem(folder / LIDARS / name, CLOUD_SUFFIXES) for name in lidars[1:]}
     images = {
         name: _of_same_number(
             clouds, files_by_stem(_image_folder(folder, of_images, name), IMAGE_SUFFIXES)
@@ -84,7 +93,10 @@ def frames_of_folder(
             return _paired_by_stamps(folder, stamped, taken, sync_tolerance_s=sync_tolerance_s)
     for name in cameras if complete else ():
         _require_pairs(folder, name, set(clouds), set(images[name]))
-    return frames_by_stem(clouds, images), ""
+    frames = frames_by_stem(clouds, images)
+    for frame in frames:
+        frame.lidars.update({n: of[frame.stem] for n, of in others.items() if frame.stem in of})
+    return frames, ""
 
 
 def _of_same_number(clouds: Mapping[str, Path], images: Mapping[str, Path]) -> dict[str, Path]:

@@ -120,6 +120,7 @@ class Frame:
         find_motion: computes the motion during the scan, for which the cloud is then corrected.
         find_twist: computes (6,) the twist of the LiDAR where the cloud is as recorded.
         twist: (6,) of the LiDAR, in place of one that is computed.
+        lidar_paths: the clouds of other LiDARs of this instant, by name.
         burnt_in: per camera, what its images are filled at when they are loaded.
         columns: names of those of a .bin cloud, if the rig states them.
         arrays: the cloud and images by their paths, which are names, if they are in memory.
@@ -136,6 +137,7 @@ class Frame:
     find_motion: Callable[[], ScanMotion] | None = field(default=None, kw_only=True)
     find_twist: Callable[[], Array] | None = field(default=None, kw_only=True)
     twist: Array | None = field(default=None, kw_only=True, compare=False)
+    lidar_paths: Mapping[str, Path] = field(default_factory=dict, kw_only=True)
     burnt_in: Mapping[str, BurntIn] = field(default_factory=dict, kw_only=True, compare=False)
     columns: tuple[str, ...] | None = field(default=None, kw_only=True)
     arrays: Mapping[Path, NDArray[Any]] = field(
@@ -189,6 +191,13 @@ class Frame:
             found = self.arrays[path] if path in self.arrays else load_cloud(path, self.columns)
         return thin_cloud(found)
 
+    def load_lidar(self, name: str) -> NDArray[np.float32]:
+        """(n, 4) the cloud of another LiDAR, as it was recorded, in its own frame."""
+        path = self.lidar_paths[name]
+        if path.suffix == MESSAGE_SUFFIX:
+            return with_intensity(load_bag_cloud(path))
+        return load_cloud(path)
+
     def describe_cloud(self) -> list[str]:
         """Notes about its cloud; none if it cannot be read, which is named where it is loaded."""
         path = self.cloud_path
@@ -241,7 +250,7 @@ class Frame:
     @cached_property
     def _hashes(self) -> dict[str, str]:
         found = {path: hashlib.sha256(a.tobytes()).hexdigest() for path, a in self.arrays.items()}
-        paths = (self.cloud_path, *self.image_paths.values())
+        paths = (self.cloud_path, *self.image_paths.values(), *self.lidar_paths.values())
         return {str(path): found.get(path) or hash_source(path) for path in paths}
 
     def entry(self) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from decimal import Decimal
 from pathlib import Path
 from shlex import quote
@@ -39,11 +39,12 @@ _WAYS_OUT = {
 
 @dataclass(frozen=True)
 class FrameFiles:
-    """The files of one frame, which share their stem."""
+    """The files of one frame, which share their stem; the clouds of other LiDARs, if it has any."""
 
     stem: str
     cloud: Path
     images: dict[str, Path]
+    lidars: dict[str, Path] = field(default_factory=dict)
 
 
 def way_out(path: Path) -> str | None:

@@ -13,7 +13,7 @@ from calibgraph.files import checked_model, read_json, read_yaml
 from calibgraph.io.bags import BagOptions, is_bag
 from calibgraph.io.bags.rig import read_bag_rig
 from calibgraph.io.calibrations import is_calibration, rig_of_calibration
-from calibgraph.io.dataset_folders import published_folder
+from calibgraph.io.dataset_folders import LIDARS, published_folder
 from calibgraph.io.kitti import CALIBRATION_NAME, kitti_sequence
 from calibgraph.model.geometry import angle_deg, camera_center
 from calibgraph.model.result_files import CALIBRATION_FILE
@@ -119,7 +119,9 @@ def find_rig_file(path: Path | str) -> Path | None:
     if not folder.is_dir() or is_bag(folder) or published_folder(folder):
         return folder
     names = (CALIBRATION_FILE, RIG_FILE)
-    if (folder / "lidar").is_dir():  # a dataset, which may have a result written into it
+    if (folder / "lidar").is_dir() or (
+        folder / LIDARS
+    ).is_dir():  # a dataset, which may have a result written into it
         names = (RIG_FILE, CALIBRATION_FILE)
     paths = (folder / name for name in (*names, CALIBRATION_NAME))
     return next((path for path in paths if path.is_file()), None)
@@ -134,11 +136,19 @@ _UPRIGHT = 0.95  # of sin(elevation), 72 deg: beyond, left and right mean little
 
 
 def describe_rig(rig: Rig) -> list[str]:
-    """One sentence per camera, in a LiDAR frame x forward, y left, z up, and per relative pose."""
+    """One sentence per camera and LiDAR, in a frame x forward, y left, z up, and relative pose."""
     lines = []
     for name, T in rig.T_camera_lidar.items():
         center = _position(camera_center(T), _LIDAR_SIDES, "the LiDAR")
         lines.append(f"{name} looks {_direction(T)}, {center}")
+    for name in rig.other_lidars:
+        if name not in rig.T_base_lidar:
+            lines.append(f"LiDAR {name} has no guess")
+            continue
+        pose = rig.T_base_lidar[name]
+        where = _position(pose[:3, 3], _LIDAR_SIDES, rig.lidar)
+        turned = f"turned by {angle_deg(pose[:3, :3]):.0f} deg against it"
+        lines.append(f"LiDAR {name} {where}, {turned}")
     for pair in rig.relative_poses:
         sigma_deg = math.degrees(pair.rotation_sigma_rad)
         lines.append(

@@ -80,27 +80,28 @@ def find_up(cloud: NDArray[np.floating], cameras: Iterable[Array]) -> Array | No
     if length > _SURE_UP and up[2] > _NEAR_UP * length:
         return Z_UP
     directions = [Z_UP[2], up / max(length, _TINY)][: 1 + (length > _SURE_UP)]
-    grounds = [_ground(cloud, direction) for direction in directions]
+    grounds = [find_ground(cloud, direction) for direction in directions]
     best = max(grounds, key=lambda ground: ground[0])
     rival = max((ground[0] for ground in grounds if ground is not best), default=0.0)
     if best[0] < max(_LEAST_GROUND, _MORE_GROUND * rival):
         return None
     if best is grounds[0]:
         return Z_UP
-    return np.asarray(Rotation.align_vectors(Z_UP[2:], best[1][None])[0].as_matrix())
+    return np.asarray(Rotation.align_vectors(Z_UP[2:], best[2][None])[0].as_matrix())
 
 
-def _ground(cloud: NDArray[np.floating], up: Array) -> tuple[float, Array]:
+def find_ground(cloud: NDArray[np.floating], up: Array) -> tuple[float, float, Array]:
     """The plane across a direction with most points on it, hardly any below and the LiDAR above.
 
     Returns:
-        The share of the points near the LiDAR that lie on it, and its (3,) normal.
+        The share of the points near the LiDAR that lie on it, the height of the LiDAR [m] over it,
+        and its (3,) normal.
     """
     rng = np.random.default_rng(0)
     ranges = np.linalg.norm(cloud[:, :3], axis=1)
     near = cloud[(ranges > _LEAST_RANGE_M) & (ranges < _GROUND_REACH_M), :3].astype(np.float64)
     if len(near) < _MIN_POINTS:
-        return 0.0, up
+        return 0.0, 0.0, up
     points = near[rng.integers(len(near), size=_GROUND_POINTS)]
     a, b, c = points[rng.integers(len(points), size=(3, _TRIPLES))]
     normal = np.cross(b - a, c - a)
@@ -113,9 +114,9 @@ def _ground(cloud: NDArray[np.floating], up: Array) -> tuple[float, Array]:
     on_it = (np.abs(heights) < _GROUND_M).mean(axis=1)
     on_it[(heights < -_BELOW_M).mean(axis=1) > _MOST_BELOW] = 0.0
     if not on_it.any():
-        return 0.0, up
+        return 0.0, 0.0, up
     best = int(on_it.argmax())
-    return float(on_it[best]), normal[possible][best]
+    return float(on_it[best]), float(height_m[possible][best]), normal[possible][best]
 
 
 @dataclass(frozen=True, eq=False)

@@ -116,10 +116,11 @@ class Calibration:
         covariance: the marginal of the error model: per camera, (6, 6) of xi in T_camera_lidar =
             exp(xi) estimate, xi = (rotation [rad], translation [m]) in the camera's axes; None
             where not determined.
-        joint_covariance: (6 N, 6 N) over all cameras in the rig's order, or None.
+        joint_covariance: (6 N, 6 N) over the sensors of ``joint_names``, or None.
         pair_covariance: per pair "A->B" of cameras with error bars, (6, 6) of xi in T_B_A = exp(xi)
             estimate, in B's axes: of the cameras as they are mounted, whatever the cloud.
         camera_verdicts: per camera.
+        lidar_verdicts: per LiDAR but the base, of a rig of several.
         residuals: per camera that had correspondences.
         counts: per camera, correspondences left after each filter and the gate, and frames.
         timings_s: seconds per stage.
@@ -158,6 +159,7 @@ class Calibration:
     timings_s: dict[str, float]
     terms: Terms
     config: Config
+    lidar_verdicts: dict[str, Verdict] = field(default_factory=dict)
     pair_covariance: Mapping[str, Array] = field(default_factory=dict)
     stage1_T_camera_lidar: dict[str, Array] = field(default_factory=dict)
     weaknesses: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
@@ -201,17 +203,30 @@ class Calibration:
 
     @property
     def verdict(self) -> Verdict:
-        """Of the rig: the worst of its cameras, with the checks of all."""
-        return rig_verdict(self.camera_verdicts)
+        """Of the rig: the worst of its sensors, with the checks of all."""
+        return rig_verdict(self.verdicts)
+
+    @property
+    def verdicts(self) -> dict[str, Verdict]:
+        """Per camera, and per LiDAR but the base."""
+        return {**self.camera_verdicts, **self.lidar_verdicts}
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """The sensors of ``joint_covariance``, 6 rows each: cameras, then LiDARs but the base.
+
+        They are independent: cameras are calibrated to the base LiDAR alone.
+        """
+        return (*self.rig.cameras, *self.lidar_verdicts)
 
     @property
     def summary(self) -> Summary:
         """The verdict for people: the worst reasons, what to do, and the rest."""
-        return self.summary_of(*self.rig.cameras)
+        return self.summary_of(*self.verdicts)
 
     def summary_of(self, *cameras: str) -> Summary:
-        """The same of some of its cameras."""
-        verdicts = {name: self.camera_verdicts[name] for name in cameras}
+        """The same of some of its cameras and LiDARs."""
+        verdicts = {name: self.verdicts[name] for name in cameras}
         weaknesses = {name: self.weaknesses.get(name, ()) for name in cameras}
         sources = {n: self.error_sources[n] for n in cameras if n in self.error_sources}
         return summarize(verdicts, weaknesses, sources, self.moves)
@@ -222,6 +237,21 @@ class Calibration:
         return self.rig.T_camera_lidar
 
     @property
+    def T_base_lidar(self) -> dict[str, Array]:
+        """Each LiDAR's (4, 4) estimate: p_base = T_base_lidar * p_lidar; the base's identity."""
+        return self.rig.T_base_lidar
+
+    @property
+    def T_vehicle_lidar(self) -> Array | None:
+        """(4, 4) of the base: p_vehicle = T_vehicle_lidar * p_base; None without a vehicle."""
+        return None if self.rig.vehicle is None else self.rig.vehicle.T_vehicle_lidar
+
+    @property
+    def vehicle_sigmas(self) -> Array | None:
+        """(6,) of it, rotation [rad] and translation [m] in the vehicle's axes; inf: unknown."""
+        return None if self.rig.vehicle is None else self.rig.vehicle.sigmas
+
+    @property
     def T_lidar_camera(self) -> dict[str, Array]:
         """The (4, 4) inverses, each camera's pose in the LiDAR frame, as ROS's tf has it."""
         return {name: geometry.invert(T) for name, T in self.T_camera_lidar.items()}
@@ -229,10 +259,14 @@ class Calibration:
     def sigmas(self, name: str) -> tuple[Array, Array] | None:
         """Standard deviations of a camera or pair "A->B", along the axes of the camera, or of B.
 
+        Of a LiDAR, about and along the axes of the base.
+
         Returns:
             (3,) rotation [deg], (3,) translation [cm]; None where not determined.
         """
         covariance = self.covariance.get(name, self.pair_covariance.get(name))
+        if name in self.lidar_verdicts:
+            covariance = (self.rig.lidars or {})[name].covariance
         return None if covariance is None else geometry.degrees_and_centimetres(covariance)
 
     @property
@@ -254,8 +288,8 @@ class Calibration:
         It is computed around the result, so that it means nothing where a verdict is FAIL.
         """
         pairs = {f"{a}->{b}": (a, b) for a, b in combinations(self.rig.cameras, 2)}
-        cameras = (name,) if name in self.rig.cameras else pairs[name]
-        return all(self.camera_verdicts[camera].status != "FAIL" for camera in cameras)
+        sensors = (name,) if name in self.verdicts else pairs[name]
+        return all(self.verdicts[sensor].status != "FAIL" for sensor in sensors)
 
     def error_bar(self, name: str) -> tuple[Array, Array] | None:
         """The standard deviations of :meth:`sigmas` where they hold, else None."""
@@ -299,16 +333,16 @@ class Calibration:
         return path
 
     def __repr__(self) -> str:
-        return f"Calibration({self.verdict.status}; {', '.join(self.rig.cameras)})"
+        return f"Calibration({self.verdict.status}; {', '.join(self.verdicts)})"
 
     def _to_mapping(self) -> dict[str, Any]:
         cameras = self.rig.cameras
-        verdicts = self.camera_verdicts.items()
         content = {
             "format": result_files.CALIBRATION_FORMAT,
             "verdict": self.verdict.to_mapping(),
             "summary": self.summary,
-            "camera_verdicts": {n: {**of.to_mapping(), "checks": of.checks} for n, of in verdicts},
+            "camera_verdicts": _verdict_mapping(self.camera_verdicts),
+            "lidar_verdicts": _verdict_mapping(self.lidar_verdicts),
             "frames": FRAMES_SENTENCE,
             "sigmas": {name: _sigma_mapping(self.covariance[name]) for name in cameras},
             "error_bar_holds": {
@@ -324,14 +358,19 @@ class Calibration:
 
 
 _KEYS = (
-    "format", "verdict", "summary", "camera_verdicts", "weaknesses", "prior_share",
-    "error_sources", "frames", "T_camera_lidar", "sigmas", "error_bar_holds", "rig",
-    "covariance_of", "covariance", "joint_covariance", "pair_covariance_of", "pair_covariance",
+    "format", "verdict", "summary", "camera_verdicts", "lidar_verdicts", "weaknesses",
+    "prior_share", "error_sources", "frames", "T_camera_lidar", "sigmas", "error_bar_holds", "rig",
+    "covariance_of", "covariance", "joint_names", "joint_covariance", "pair_covariance_of",
+    "pair_covariance",
     "lens", "lens_covariance", "bootstrap_covariance", "residuals", "counts", "frames_used",
     "moves", "places", "rounds", "warnings", "initial_rig", "stage1_T_camera_lidar", "terms",
     "config", "timings_s", "inputs", "versions", "date",
 )  # fmt: skip
 """Of the file, in its order; those that are no attributes are made for it."""
+
+
+def _verdict_mapping(verdicts: Mapping[str, Verdict]) -> dict[str, Any]:
+    return {name: {**of.to_mapping(), "checks": of.checks} for name, of in verdicts.items()}
 
 
 def _sigma_mapping(covariance: Array | None) -> dict[str, list[float]] | None:

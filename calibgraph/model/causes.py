@@ -87,6 +87,12 @@ CAUSES: dict[str, Cause] = {
          "one_pose": "Look whether both cameras have the images of one device; if they are mounted "
          "so, state it in relative_poses."},
     ),
+    "lidars": Cause(
+        "Check T_base_lidar of this LiDAR: p_base = T_base_lidar * p_lidar.",
+        {"lidar_matched": "Check the guess of this LiDAR, and record while the vehicle stands, or "
+         "with clouds of one time.",
+         "lidar_places": "Record while the vehicle stands; if it stood, check the LiDAR's mount."},
+    ),
     "priors": Cause(
         "Check relative_poses and priors in the rig: p_a = T_a_b * p_b, and their sigmas.",
         {"relative_pose": "",
@@ -124,6 +130,9 @@ CAUSES: dict[str, Cause] = {
          "excluded": "To calibrate it by its own matches, take it out of excluded_cameras.",
          "correspondences_used": "Give at least 50 matches.",
          "frames": "Record at least 5 frames, 10 s apart.",
+         "lidar_instants": "Record at least 3 instants at different places.",
+         "lidar_loose": "Record where surfaces of three directions are in view of both LiDARs: "
+         "ground, and walls along and across the road.",
          "image evidence": _STRUCTURE,
          "images": "Calibrate again from images and clouds.",
          "common_error": "State the error that all frames share (0 if none): common_deg and "

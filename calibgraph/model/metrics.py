@@ -89,7 +89,7 @@ def evaluate(
     Raises:
         RigError: if a camera of the estimate is not in the reference.
     """
-    for name in estimate.cameras:
+    for name in estimate.require_cameras().cameras:
         if name not in reference.cameras:
             raise RigError(
                 f"camera {name!r} of the estimate is not in the reference, which has "

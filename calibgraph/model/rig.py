@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Mapping
 from functools import cached_property
@@ -166,6 +167,14 @@ def _checked_model(name: Any) -> Any:
 CameraName = Annotated[str, AfterValidator(_checked_name)]
 FrameId = Annotated[str, Field(pattern=r"^\S{1,200}$"), AfterValidator(_require_printable)]
 Sigma = Annotated[float, Field(ge=1e-5, allow_inf_nan=False)]  # below, LM stalls
+KnownSigma = (
+    Annotated[float, Field(ge=1e-5)]
+    | tuple[
+        Annotated[float, Field(ge=1e-5)],
+        Annotated[float, Field(ge=1e-5)],
+        Annotated[float, Field(ge=1e-5)],
+    ]
+)
 Size = Annotated[int, Field(gt=0, le=1_000_000, strict=True)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Bounded = Annotated[float, Field(ge=-MAX_COORDINATE, le=MAX_COORDINATE, allow_inf_nan=False)]
@@ -301,15 +310,74 @@ class RelativePose(_Model):
     translation_sigma_m: Sigma
 
 
+class Lidar(_Model):
+    """One of several LiDARs: its pose in the base LiDAR, a guess or a result, if it is known.
+
+    ``covariance`` is that of a result: (6, 6) of (rotation [rad], translation [m]) in the base's
+    axes, R = exp(rotation) R_estimate, t = t_estimate + translation.
+    """
+
+    T_base_lidar: Transform | None = None
+    covariance: PoseCovariance | None = None
+
+
+class Vehicle(_Model):
+    """The vehicle's frame, and what is known of the base LiDAR in it.
+
+    A sigma is a number or three, of x, y, z; .inf for what is unknown.
+    """
+
+    frame: FrameId = "base_link"
+    T_vehicle_lidar: Transform | None = None
+    rotation_sigma_rad: KnownSigma = math.inf
+    translation_sigma_m: KnownSigma = math.inf
+
+    @property
+    def sigmas(self) -> Array:
+        """(6,) of rotation [rad] and translation [m], in the vehicle's axes."""
+        return np.hstack(
+            [
+                np.broadcast_to(self.rotation_sigma_rad, 3),
+                np.broadcast_to(self.translation_sigma_m, 3),
+            ]
+        )
+
+
 class Rig(_Model):
-    """A LiDAR and its cameras, in a fixed order."""
+    """A LiDAR and its cameras, in a fixed order; other LiDARs, and the vehicle.
+
+    ``lidar`` is the base: ``T_camera_lidar`` and ``T_base_lidar`` are of it. A rig of several
+    LiDARs names them all in ``lidars`` and may have no camera.
+    """
 
     format: Literal["calibgraph-rig/1"] = RIG_FORMAT
     lidar: str = "lidar"
-    cameras: Annotated[dict[CameraName, Camera], Field(min_length=1)]
+    cameras: dict[CameraName, Camera] = {}
+    lidars: dict[CameraName, Lidar] | None = None
+    vehicle: Vehicle | None = None
     relative_poses: tuple[RelativePose, ...] = ()
     cloud_columns: tuple[str, ...] | None = None
     """Names of the float32 columns of .bin clouds, such as x, y, z, intensity, ring."""
+
+    @model_validator(mode="after")
+    def _lidars_fit(self) -> Self:
+        names = [*(self.lidars or {})]
+        if not self.cameras and len(names) <= 1:
+            raise ValueError("cameras: the rig has none; name one, or at least two lidars")
+        if names and self.lidar not in names:
+            raise ValueError(
+                f"lidar: the base {self.lidar!r} is none of the lidars {', '.join(names)}"
+            )
+        if self.vehicle is not None and len(names) <= 1:
+            raise ValueError("vehicle: is found with several lidars; name them, or leave it out")
+        if both := [name for name in names if name in self.cameras]:
+            raise ValueError(f"lidars: {both[0]!r} is a camera, too; rename one")
+        T = self.lidars[self.lidar].T_base_lidar if self.lidars else None
+        if T is not None and np.abs(T - np.eye(4)).max() > ROUNDING:
+            raise ValueError(
+                f"lidars.{self.lidar}.T_base_lidar: of the base it is the identity; leave it out"
+            )
+        return self
 
     @model_validator(mode="after")
     def _relative_poses_name_cameras(self) -> Self:
@@ -325,9 +393,40 @@ class Rig(_Model):
         return self
 
     @property
+    def T_base_lidar(self) -> dict[str, Array]:
+        """(4, 4) of each LiDAR whose pose is known, the base's identity among them."""
+        known = {n: of.T_base_lidar for n, of in (self.lidars or {}).items()} | {
+            self.lidar: np.eye(4)
+        }
+        return {name: T for name, T in known.items() if T is not None}
+
+    @property
+    def all_lidars(self) -> tuple[str, ...]:
+        """Names of several LiDARs, the base first; empty if the rig names none."""
+        return (self.lidar, *self.other_lidars) if self.lidars else ()
+
+    @property
+    def other_lidars(self) -> tuple[str, ...]:
+        """Names of the LiDARs but the base."""
+        return tuple(name for name in self.lidars or {} if name != self.lidar)
+
+    @property
     def T_camera_lidar(self) -> dict[str, Array]:
         """Each camera's (4, 4) transform: p_camera = T_camera_lidar * p_lidar."""
         return {name: camera.T_camera_lidar for name, camera in self.cameras.items()}
+
+    def require_cameras(self) -> Rig:
+        """The rig itself.
+
+        Raises:
+            RigError: if it has no camera.
+        """
+        if not self.cameras:
+            raise RigError(
+                f"the rig has no camera, only LiDARs ({', '.join(self.lidars or {})}); these are "
+                "calibrated by calibrate, read by report and written by export"
+            )
+        return self
 
     def moved_to(self, T_camera_lidar: Mapping[str, Array]) -> Rig:
         """The same rig with other T_camera_lidar, (4, 4), of some cameras or all.

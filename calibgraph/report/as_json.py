@@ -39,6 +39,17 @@ def result_summary(result: Calibration, written: list[Path]) -> dict[str, Any]:
                 result.joint_of_lens(name) if name in result.lens_covariance else None
             ),
         }
+    lidars = {
+        name: {
+            "T_base_lidar": result.T_base_lidar[name].tolist(),
+            "verdict": verdict.status,
+            "cannot_tell": verdict.cannot_tell,
+            "probability_off": _probability(verdict),
+            "reasons": list(verdict.reasons),
+            **_sigmas(result, name),
+        }
+        for name, verdict in result.lidar_verdicts.items()
+    }
     return {
         "verdict": result.verdict.status,
         "cannot_tell": result.verdict.cannot_tell,
@@ -48,6 +59,7 @@ def result_summary(result: Calibration, written: list[Path]) -> dict[str, Any]:
         "warnings": list(result.warnings),
         "places": [list(place) for place in result.places],
         "cameras": cameras,
+        "lidars": lidars,
         "pairs": {name: _sigmas(result, name) for name in result.pair_covariance},
         "timings_s": result.timings_s,
         "files": [str(path) for path in written],

@@ -67,7 +67,7 @@ def render_page(result: Calibration) -> str:
     shown = frame_of_entry(result.frames[len(result.frames) // 2]) if result.frames else None
     if shown is None:
         overlays_left_out = "the result was made from a table, which names no images"
-    else:
+    elif rig.cameras:
         pairs = {name: (guess.cameras[name], camera) for name, camera in rig.cameras.items()}
         overlays, overlays_left_out = draw_overlays(shown, pairs)
     cameras = [
@@ -83,10 +83,12 @@ def render_page(result: Calibration) -> str:
         }
         for index, (name, camera) in enumerate(rig.cameras.items())
     ]
+    lidars = [_lidar_row(result, name) for name in result.lidar_verdicts]
     summary = result.summary
     return page_template("calibgraph.report").render(
         result=result,
         cameras=cameras,
+        lidars=lidars,
         summary=summary,
         recording=recording_name(result),
         places=describe_places(result.places) if result.places else "",
@@ -109,6 +111,17 @@ def render_page(result: Calibration) -> str:
         frames_sentence=FRAMES_SENTENCE,
         tangent_sentence=TANGENT_SENTENCE,
     )
+
+
+def _lidar_row(result: Calibration, name: str) -> dict[str, Any]:
+    guess, moved = result.initial_rig.T_base_lidar, ("-", "-")
+    if name in guess:
+        error = pose_error(result.T_base_lidar[name], guess[name])
+        moved = f"{error.rotation_error_deg:.2f}", f"{error.translation_error_cm:.1f}"
+    return {
+        "name": name, "anchor": f"lidar-{[*result.lidar_verdicts].index(name)}", "moved": moved,
+        "verdict": result.lidar_verdicts[name], "sigmas": result.error_bar(name),
+    }  # fmt: skip
 
 
 def _camera_pairs(result: Calibration) -> list[dict[str, Any]]:

@@ -7,6 +7,8 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+import gtsam
+import numpy as np
 from rich.box import SIMPLE
 from rich.console import Console
 from rich.markup import escape
@@ -23,6 +25,7 @@ from calibgraph.model.verdict import fixed
 CAMERA_AXES = (
     "pitch x\ndeg", "yaw y\ndeg", "roll z\ndeg", "x right\ncm", "y down\ncm", "z ahead\ncm",
 )  # fmt: skip
+LIDAR_AXES = ("roll x\ndeg", "pitch y\ndeg", "yaw z\ndeg", "x\ncm", "y\ncm", "z\ncm")
 _COLOURS = {"PASS": "green", "WARN": "yellow", "FAIL": "red"}
 
 
@@ -61,6 +64,22 @@ def print_result(
     """Print the verdict with its reasons, a line per camera, and the files that were written."""
     details = next((path.name for path in written if path.suffix == ".html"), CALIBRATION_FILE)
     print_summary(console, result.summary, details)
+    if result.rig.cameras:
+        _print_cameras(console, result)
+    if result.lidar_verdicts:
+        console.print(lidar_table(result))
+        console.print(
+            f"moved: change from the guess. 1 sigma about and along the axes of {result.rig.lidar}."
+        )
+    if result.vehicle_sigmas is not None:
+        console.print(vehicle_table(result))
+    frames = FRAMES_SENTENCE if result.rig.cameras else "p_base = T_base_lidar * p_lidar"
+    console.out(f"{elapsed_s:.1f} s; {frames}; written:", highlight=False)
+    for path in written:
+        console.out(f"  {path}", highlight=False)
+
+
+def _print_cameras(console: Console, result: Calibration) -> None:
     console.print(result_table(result))
     config = result.config
     console.print(
@@ -82,9 +101,6 @@ def print_result(
         console.out(result.unstated_lenses, highlight=False)
     if result.lens:
         console.print(lens_table(result))
-    console.out(f"{elapsed_s:.1f} s; {FRAMES_SENTENCE}; written:", highlight=False)
-    for path in written:
-        console.out(f"  {path}", highlight=False)
 
 
 def print_summary(console: Console, summary: Summary, details: str) -> None:
@@ -133,6 +149,39 @@ def result_table(result: Calibration) -> Table:
         ])  # fmt: skip
     numbers = ("off", "moved\ndeg", "moved\ncm", "median\npx", "inliers", "matches", "frames")
     return make_table("Calibration", rows, words=("verdict",), numbers=(*numbers, "prior"))
+
+
+def lidar_table(result: Calibration) -> Table:
+    """One row per LiDAR but the base: verdict, change from the guess, a sigma per axis."""
+    rows, guess = [], result.initial_rig.T_base_lidar
+    for name, verdict in result.lidar_verdicts.items():
+        sigmas, moved = result.error_bar(name), ["-", "-"]
+        if name in guess:
+            error = pose_error(result.T_base_lidar[name], guess[name])
+            moved = [fixed(error.rotation_error_deg, 2), fixed(error.translation_error_cm, 1)]
+        rows.append([
+            name, f"[{_COLOURS[verdict.status]}]{verdict.status}[/]", verdict.percent, *moved,
+            *(["-"] * 6 if sigmas is None else _per_axis(*sigmas)),
+        ])  # fmt: skip
+    numbers = ("off", "moved\ndeg", "moved\ncm", *LIDAR_AXES)
+    return make_table(
+        f"LiDARs in {result.rig.lidar}", rows, names=("LiDAR",), words=("verdict",), numbers=numbers
+    )
+
+
+def vehicle_table(result: Calibration) -> Table:
+    """Roll, pitch, yaw and the position of the base LiDAR on the vehicle, with their sigmas."""
+    assert result.rig.vehicle is not None
+    T, sigmas = result.rig.vehicle.T_vehicle_lidar, result.rig.vehicle.sigmas
+    scale = np.repeat([180.0 / np.pi, 100.0], 3)
+    values = np.zeros(6) if T is None else np.concatenate([gtsam.Rot3(T[:3, :3]).rpy(), T[:3, 3]])
+    known = np.isfinite(sigmas)
+    rows = [
+        ["value", *(fixed(v, 2) if k else "-" for v, k in zip(values * scale, known, strict=True))],
+        ["sigma", *(fixed(v, 3) if k else "-" for v, k in zip(sigmas * scale, known, strict=True))],
+    ]
+    title = f"{result.rig.lidar} in {result.rig.vehicle.frame}"
+    return make_table(title, rows, names=("",), numbers=LIDAR_AXES)
 
 
 def error_bar_table(result: Calibration) -> Table:

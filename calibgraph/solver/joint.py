@@ -70,7 +70,7 @@ def solve_joint(
     if terms not in TERMS:
         raise ValueError(f"unknown terms {terms!r}; known are {', '.join(TERMS)}")
     config, watch = config or Config(), Stopwatch()
-    require_known(rig, config.excluded_cameras)
+    require_known(rig.require_cameras(), config.excluded_cameras)
     _require_same_cameras(rig, camera_matches)
     if lenses is None and config.estimate:
         return _solve_with_lenses(rig, table, config, terms, camera_matches=camera_matches)

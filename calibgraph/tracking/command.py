@@ -160,6 +160,7 @@ def track(
         CalibrationError: if the source, the rig or the state cannot be used, or there is no frame.
     """
     require_stdout()
+    settings.rig.require_cameras()
     waits = str(source[0]) == "-"  # frames come at their own times
     with _stopped_by_signals() as stop:
         if waits:

@@ -68,6 +68,17 @@ THRESHOLDS: tuple[Threshold, ...] = (
     # With fewer, the error bar is mostly a prior.
     Threshold("frames", "frames", "at least", ENOUGH_FRAMES, 0, "", "Are there enough frames?",
               "the error bar is mostly a default, not measured"),
+    # LiDARs. Right poses have 0.976 and more (two vehicles, three places), wrong ones 0.58 to 0.96.
+    Threshold("lidar_matched", "planes that lie on another LiDAR's", "at least", 0.95, 0.8,
+              "share", "Do the planes that LiDARs have in common coincide?",
+              "check the guess T_base_lidar, and that the clouds of an instant are of one time"),
+    # Of a prior of 0.1 deg and 1.5 cm.
+    Threshold("lidar_places", "deviation between places over its prior", "at most", 2.0, 4.0,
+              "times", "Do places give the same poses of LiDARs?",
+              "were the clouds of an instant taken at different times, or has a LiDAR moved?"),
+    # With fewer, what places differ by is mostly a prior.
+    Threshold("lidar_instants", "instants", "at least", 3, 0, "",
+              "Are there enough instants?", "the error bar is mostly a default, not measured"),
     # the matcher
     # A choice; no data recorded.
     Threshold("start_dependence", "start dependence", "at most", 0.25, 0.5, "share",

@@ -19,6 +19,7 @@ from calibgraph.audit import page as audit_tables
 from calibgraph.model.calibration import Calibration, Residuals
 from calibgraph.model.lens import LensEstimate
 from calibgraph.model.metrics import Deviation, Evaluation, PoseError
+from calibgraph.model.rig import Lidar, Vehicle
 from calibgraph.model.verdict import ErrorProbability, Verdict
 from calibgraph.report import tables
 
@@ -64,6 +65,24 @@ def evaluation() -> Evaluation:
                       dict.fromkeys(NAMES, found))  # fmt: skip
 
 
+def with_lidars(extreme: Calibration) -> Calibration:
+    """The same numbers of LiDARs."""
+    base, other = (f"lidar_{name}" for name in NAMES)
+    far = Lidar(T_base_lidar=_moved(np.eye(4)), covariance=COVARIANCE)
+    turns = tuple(map(abs, TWIST[:3].tolist()))
+    vehicle = Vehicle(
+        T_vehicle_lidar=_moved(np.eye(4)), rotation_sigma_rad=turns, translation_sigma_m=12345.678
+    )
+    known = {"lidar": base, "lidars": {base: Lidar(), other: far}, "vehicle": vehicle}
+    guess = {"lidar": base, "lidars": {base: Lidar(), other: Lidar(T_base_lidar=np.eye(4))}}
+    return replace(
+        extreme,
+        rig=extreme.rig.model_copy(update=known),
+        initial_rig=extreme.rig.model_copy(update=guess),
+        lidar_verdicts={other: Verdict((), ErrorProbability(0.001, 0.98))},
+    )
+
+
 def audit(extreme: Calibration) -> Audit:
     """One that cannot tell."""
     camera = CameraAudit("CANNOT TELL", "a reason", TWIST.copy(), -TWIST, -TWIST)
@@ -88,6 +107,8 @@ TABLES: dict[str, Callable[[Calibration], Table]] = {
     "result_table": tables.result_table,
     "error_bar_table": tables.error_bar_table,
     "lens_table": tables.lens_table,
+    "lidar_table": lambda result: tables.lidar_table(with_lidars(result)),
+    "vehicle_table": lambda result: tables.vehicle_table(with_lidars(result)),
     "evaluation_table": lambda _: tables.evaluation_table(evaluation()),
     "deviation_table": lambda _: tables.deviation_table(evaluation()),
     "audit_table": lambda result: audit_tables.audit_table(audit(result)),

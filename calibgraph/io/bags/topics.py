@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from shlex import quote
 
 from calibgraph.errors import DatasetError
@@ -60,11 +60,20 @@ class CameraTopics:
 
 @dataclass(frozen=True)
 class RigTopics:
-    """The topics of a LiDAR and of cameras, by the cameras' names; ``notes`` name others."""
+    """The topics of a LiDAR and of cameras, by the cameras' names; ``notes`` name others.
+
+    Of several LiDARs ``lidar`` is the base, and ``lidars`` are those of the others.
+    """
 
     lidar: str
     cameras: Mapping[str, CameraTopics]
     notes: tuple[str, ...] = ()
+    lidars: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def paired(self) -> dict[str, str]:
+        """The topics that are paired with the LiDAR's clouds: of images, and of other LiDARs."""
+        return {name: each.image for name, each in self.cameras.items()} | dict(self.lidars)
 
 
 def choose_topics(
@@ -72,6 +81,8 @@ def choose_topics(
     named: Mapping[str, str],
     cameras: Sequence[str] | None = None,
     drive: Iterable[Bag] | None = None,
+    *,
+    lidars: Sequence[str] = (),
 ) -> RigTopics:
     """The topics of the LiDAR and the cameras.
 
@@ -80,6 +91,7 @@ def choose_topics(
         named: the topic of ``lidar`` and those of cameras, where they are not left to be found; of
             a camera with that of its CameraInfo behind a comma, where several could be.
         cameras: names that are wanted; those named, or if none is all that have a CameraInfo.
+        lidars: names of a rig's LiDARs if there are several, the base first.
         drive: the bag, and others whose CameraInfo serve where it has none; the bag alone if None.
     """
     bags = [*(drive or [bag])]
@@ -90,16 +102,18 @@ def choose_topics(
                 raise DatasetError(
                     f"{bag.path}: has no messages of {each} ({name}); {_listed(bag)}"
                 )
-    chosen = {name: parts for name, parts in parted.items() if name not in (LIDAR, ODOMETRY)}
+    chosen = {
+        name: parts for name, parts in parted.items() if name not in (LIDAR, ODOMETRY, *lidars)
+    }
     wanted = list(chosen) if cameras is None else list(cameras)
     for name in set(chosen) - set(wanted):
         raise DatasetError(f"--topic {name}: the rig has no such camera, but {', '.join(wanted)}")
     infos = _Infos(bag, bags)
     found = _found_cameras(bag, infos)
-    names = wanted or list(found)
+    names = wanted or ([] if lidars else list(found))
     if set(names) - set(found):  # the rig has the lenses, the bag need not
         found = {**_found_cameras(bag, None), **found}
-    if not names:
+    if not names and not lidars:
         raise DatasetError(f"{bag.path}: {_why_no_camera(bag, infos)}")
     topics = {}
     for name in names:
@@ -114,8 +128,11 @@ def choose_topics(
             CameraTopics(image, tuple(info)) if info
             else CameraTopics(image, infos.of(image), infos.rivals(image))
         )  # fmt: skip
-    lidar = named.get(LIDAR) or _lidar_topic(bag)
-    return RigTopics(lidar, topics, tuple(_unused(bag, infos, topics.values())))
+    unused = tuple(_unused(bag, infos, topics.values()))
+    if lidars:
+        base, *others = (named.get(name) or _topic_of_lidar(bag, name) for name in lidars)
+        return RigTopics(base, topics, unused, dict(zip(lidars[1:], others, strict=True)))
+    return RigTopics(named.get(LIDAR) or _lidar_topic(bag), topics, unused)
 
 
 def _unused(bag: Bag, infos: _Infos, used: Iterable[CameraTopics]) -> Iterable[str]:
@@ -163,6 +180,19 @@ def _not_read(bag: Bag, *, clouds: bool = False) -> str:
         if clouds != _NOT_READ[each.type].startswith("video")
     ]
     return found[0] if found else ""
+
+
+def _topic_of_lidar(bag: Bag, name: str) -> str:
+    """The topic of clouds that has the name of a LiDAR between its slashes."""
+    clouds = [each.name for each in bag.of_type(*CLOUDS)]
+    found = [topic for topic in clouds if name in topic.split("/")]
+    if len(found) != 1:
+        listed = ", ".join(clouds) or "none"
+        raise DatasetError(
+            f"{bag.path}: which topic has the clouds of LiDAR {name!r}? Those of clouds are "
+            f"{listed}: name it by --topic {quote(name)}=/TOPIC"
+        )
+    return found[0]
 
 
 def _lidar_topic(bag: Bag) -> str:

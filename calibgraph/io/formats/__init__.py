@@ -6,8 +6,8 @@ from typing import Final
 EXPORT_FORMATS: Final[Mapping[str, str]] = {
     "kalibr": "Kalibr-style camchain YAML with T_cam_lidar and T_cn_cnm1",
     "ros2-launch": "ROS 2 launch file (.launch.xml) of static_transform_publisher nodes",
-    "urdf": "URDF with one fixed joint per camera, LiDAR -> optical frames",
-    "autoware": "Autoware's sensor_kit_calibration.yaml: camera_link, not optical",
+    "urdf": "URDF with a fixed joint per camera and LiDAR: base LiDAR -> their frames",
+    "autoware": "Autoware's sensor_kit_calibration.yaml, and sensors_calibration.yaml beside it",
     "kitti": "KITTI odometry's calib.txt: P0 to P3 and Tr",
     "camera_info": "folder of a ROS camera_info YAML per camera: lenses, no extrinsics",
     "opencv": "OpenCV FileStorage YAML: matrices, distortion, T_camera_lidar",

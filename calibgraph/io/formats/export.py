@@ -59,6 +59,7 @@ class RigExport:
         optical_frames: per camera, the id of its optical frame.
         in_tree: whether the frames are those of the rig, and of the robot's tree that it knows.
         T_base_lidar: (4, 4) where the LiDAR is mounted on the vehicle or sensor kit, if given.
+        lidars: those of several that are written beside the base.
     """
 
     rig: Rig
@@ -68,6 +69,21 @@ class RigExport:
     optical_frames: Mapping[str, str]
     T_base_lidar: Array | None = None
     in_tree: bool = True
+    lidars: tuple[str, ...] = ()
+
+    @property
+    def lidar_links(self) -> list[Link]:
+        """The LiDARs in the base."""
+        poses = self.rig.T_base_lidar
+        return [Link(self.lidar_frame, frame_id(name), poses[name]) for name in self.lidars]
+
+    @property
+    def vehicle_link(self) -> Link | None:
+        """The base LiDAR in the vehicle's frame; None if an axis of it is unknown."""
+        vehicle = self.rig.vehicle
+        if vehicle is None or vehicle.T_vehicle_lidar is None or np.isinf(vehicle.sigmas).any():
+            return None
+        return Link(vehicle.frame, self.lidar_frame, vehicle.T_vehicle_lidar)
 
     def link(self, name: str) -> tuple[str, str, Array]:
         """Parent, child and (4, 4) T_parent_child of the transform that a calibration changes."""
@@ -104,14 +120,16 @@ class RigExport:
     def statement(self, *direction: str) -> list[str]:
         """Lines for a comment: origin, direction, and a worked point of each camera."""
         frames = ", ".join(f"{name}: {frame}" for name, frame in self.optical_frames.items())
-        lines = [
-            self.origin,
-            *direction,
-            f"LiDAR frame: {self.lidar_frame}; optical frames: {frames}",
-            AXES_SENTENCE,
-            f"worked points, by {FRAMES_SENTENCE}",
-            *(self._worked_point(name) for name in self.cameras),
-        ]
+        lines = [self.origin, *direction]
+        if self.lidars:
+            lines.append(f"LiDARs in {self.lidar_frame}: p_base = T_base_lidar * p_lidar")
+        if self.cameras:
+            lines += [
+                f"LiDAR frame: {self.lidar_frame}; optical frames: {frames}",
+                AXES_SENTENCE,
+                f"worked points, by {FRAMES_SENTENCE}",
+                *(self._worked_point(name) for name in self.cameras),
+            ]
         return [" ".join(line.split()) for line in lines]
 
     def _worked_point(self, name: str) -> str:
@@ -193,6 +211,7 @@ _ANGLES = ("x", "y", "z", "roll", "pitch", "yaw")
 def write_transforms(export: RigExport, format: str) -> str:
     """Poses of frames in the form of one of ``TRANSFORMS``."""
     measured = [Link(*export.link(name)) for name in export.cameras]  # what a calibration changes
+    measured += [*_of_vehicle(export), *export.lidar_links]
     links = _WHICH[format](export) if format in _WHICH else measured
     directions = _of_kit(export) if format == "autoware" else _of_transforms(export, format)
     statement = export.statement(*directions)
@@ -210,6 +229,13 @@ def _of_transforms(export: RigExport, format: str) -> Iterator[str]:
         text = _OF_LIDAR if export.mount(name) is None else _OF_TREE
         yield text.format(camera=name, parent=parent, child=child)
     yield _MORE[format]
+
+
+def _of_vehicle(export: RigExport) -> list[Link]:
+    """The base LiDAR in the vehicle, where the robot's tree does not have it."""
+    link = export.vehicle_link
+    in_tree = any(export.mount(name) is not None for name in export.cameras)
+    return [] if link is None or in_tree else [link]
 
 
 def _launch(links: Iterable[Link]) -> ElementTree.Element:
@@ -244,7 +270,8 @@ def _joints(export: RigExport) -> list[Link]:
             joints[export.lidar_frame] = parent, mount.T_parent_lidar
         elif joints[export.lidar_frame][0] != parent:
             joints[parent] = export.lidar_frame, invert(mount.T_parent_lidar)
-    return [Link(parent, child, T) for child, (parent, T) in joints.items()]
+    found = [Link(parent, child, T) for child, (parent, T) in joints.items()]
+    return [*found, *_of_vehicle(export), *export.lidar_links]
 
 
 def _robot(export: RigExport, links: list[Link]) -> ElementTree.Element:
@@ -265,12 +292,25 @@ def _sensor_kit(export: RigExport) -> list[Link]:
     """The LiDAR and the camera_link of each camera: x forward, not optical."""
     T_base_lidar = np.eye(4) if export.T_base_lidar is None else export.T_base_lidar
     links = [Link(_KIT, export.lidar_frame, T_base_lidar)]
+    links += [Link(_KIT, of.child, T_base_lidar @ of.T_parent_child) for of in export.lidar_links]
     for name, optical in export.optical_frames.items():
         above = optical.removesuffix(_OPTICAL_LINK)  # as Autoware names it; else by the camera
         link = f"{above if above != optical else frame_id(name)}/camera_link"
         T_base_camera = T_base_lidar @ export.T_lidar_camera(name)
         links.append(Link(_KIT, link, T_base_camera @ T_OPTICAL_LINK))
     return links
+
+
+def sensors_calibration(export: RigExport) -> str:
+    """Autoware's sensors_calibration.yaml: the kit in the vehicle; empty if it is unknown."""
+    link = export.vehicle_link
+    if link is None:
+        return ""
+    T_kit_lidar = np.eye(4) if export.T_base_lidar is None else export.T_base_lidar
+    kit = Link(link.parent, _KIT, link.T_parent_child @ invert(T_kit_lidar))
+    direction = f"the pose of {_KIT} (child) in {link.parent} (parent): p_parent = T * p_child"
+    pose = dict(zip(_ANGLES, _six(kit), strict=True))
+    return commented_yaml((export.origin, direction), {link.parent: {_KIT: pose}})
 
 
 def _of_kit(export: RigExport) -> Iterator[str]:
@@ -459,6 +499,7 @@ def write_json(export: RigExport) -> str:
         "verdict": export.verdict or None,
         "lidar_frame": export.lidar_frame,
         "cameras": {name: _of_json(export, name) for name in export.cameras},
+        "lidars": {name: export.rig.T_base_lidar[name].tolist() for name in export.lidars},
     }
     return json.dumps(content, indent=2, allow_nan=False) + "\n"
 
@@ -517,6 +558,7 @@ WRITERS: Final[Mapping[str, Writer]] = {
 }
 _WITH_BASE = "autoware"
 _WITHOUT_COMMENTS = "kitti"
+_KIT_IN_VEHICLE = "sensors_calibration.yaml"
 
 
 def export_calibration(  # noqa: PLR0913
@@ -548,7 +590,8 @@ def export_calibration(  # noqa: PLR0913
 
     Returns:
         The files: one, and for ``kitti``, which has no comments, a text file beside it; for
-        ``camera_info`` one of each camera.
+        ``camera_info`` one of each camera; for ``autoware`` sensors_calibration.yaml beside it,
+        if the rig has the LiDAR in the vehicle.
 
     Raises:
         CalibrationError: if the verdict is FAIL, or the format or the file cannot hold it.
@@ -561,12 +604,15 @@ def export_calibration(  # noqa: PLR0913
     found = _loaded(source) if isinstance(source, (str, Path)) else source
     result = found if isinstance(found, Calibration) else None
     rig = found.rig if isinstance(found, Calibration) else found
+    if format not in (*TRANSFORMS, "json"):
+        rig.require_cameras()
     names = list(rig.cameras if cameras is None else cameras)
+    others = [name for name in rig.other_lidars if name in rig.T_base_lidar]
     lidar, *optical = _frames(rig, names, lidar_frame, camera_frame)
     if result is not None and not even_if_failed:
-        _require_not_failed(result, names)
+        _require_not_failed(result, [*names, *others])
     bars = {n: result.covariance.get(n) for n in names if result and result.error_bar_holds(n)}
-    verdicts = {name: result.camera_verdicts[name] for name in names} if result else {}
+    verdicts = {n: result.verdicts[n] for n in (*names, *others)} if result else {}
     export = RigExport(
         rig=rig.model_copy(update={"cameras": {name: rig.cameras[name] for name in names}}),
         covariance={n: covariance for n, covariance in bars.items() if covariance is not None},
@@ -575,6 +621,7 @@ def export_calibration(  # noqa: PLR0913
         optical_frames=dict(zip(names, optical, strict=True)),
         T_base_lidar=None if T_base_lidar is None else rigid_transform(T_base_lidar),
         in_tree=lidar_frame is None and camera_frame is None,
+        lidars=tuple(others),
     )
     return _write(export, Path(path), format, force=force)
 
@@ -598,10 +645,10 @@ def _frames(
 
 
 def _require_not_failed(result: Calibration, cameras: Sequence[str]) -> None:
-    failed = [name for name in cameras if result.camera_verdicts[name].status == "FAIL"]
+    failed = [name for name in cameras if result.verdicts[name].status == "FAIL"]
     if not failed:
         return
-    good = [name for name in cameras if name not in failed]
+    good = [n for n in cameras if n in result.camera_verdicts and n not in failed]
     named = " ".join(f"--camera {quote(name)}" for name in good)
     others = f"export the others with {named}, " if good else ""
     raise CalibrationError(
@@ -626,6 +673,8 @@ def _write(export: RigExport, path: Path, format: str, *, force: bool) -> tuple[
     }  # fmt: skip
     if format == _WITHOUT_COMMENTS:
         contents[path.with_name(f"{path.stem}.direction.txt")] = commented(kitti_statement(export))
+    if format == _WITH_BASE and (of_vehicle := sensors_calibration(export)):
+        contents[path.with_name(_KIT_IN_VEHICLE)] = of_vehicle
     for file in contents:
         require_new_file(file, force=force)
     for file, content in contents.items():

@@ -1,0 +1,1 @@
+"""Sensors beside the cameras: LiDARs relative to each other, and the vehicle that carries them."""

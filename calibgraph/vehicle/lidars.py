@@ -1,0 +1,326 @@
+"""LiDARs relative to a base LiDAR: planes of each matched with planes of all others, at once.
+
+All LiDARs and places are one system of sums (``sums.py``), so loops close by construction. At each
+place p the LiDARs stand at theta + u_p, u_p ~ N(0, D): what a place does to all its planes alike,
+such as points of other times. With H_p, g_p of a place and S_p, the scatter of its cells'
+gradients, it has the information I_p = H_p S_p^-1 H_p about theta + u_p, and u_p is eliminated as
+a camera's places are: the sum of I_p - I_p (I_p + D^-1)^-1 I_p is the information about theta. The
+sizes in D are REML estimates (Schall), about a prior.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import permutations
+
+import numpy as np
+import scipy.linalg
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from calibgraph.arrays import Array
+from calibgraph.errors import CalibrationError
+from calibgraph.vehicle.planes import Planes, find_planes
+from calibgraph.vehicle.sums import Matches, Sums, sum_up
+
+_GATES_M = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18, 0.13)  # of the residuals, while the poses converge
+_LAST_GATE_M, _MOST_ROUNDS = 0.1, 25
+_AT_PLACE = 2  # number of the gate from which a place is fitted alone
+_WIDTH = 0.5  # of the Cauchy loss over the gate, at least, while the poses converge
+_COARSE_COSINE, _FINE_COSINE = np.cos(np.radians([35.0, 20.0]))  # of two normals of one plane
+_LEAST_SCALE_M = 0.003  # of the Cauchy loss: simulated scans have none
+_CONVERGED = 1e-6  # rad and m
+_REACH_M = 3.0  # between the centres of two pieces of one plane
+_LEAST_MATCHES = 100
+_STANDS = 0.95  # share of upright planes in place from which the vehicle has not moved
+_UPRIGHT = np.cos(np.radians(45.0))  # of a normal against up: below, the plane is upright
+
+PLACE_SIGMAS = np.repeat([np.radians(0.1), 0.015], 3)
+"""(6,) [rad, m]: prior of what a LiDAR's pose differs between places, beyond what cells show: a car
+whose clouds are 10 ms apart at 1.5 m/s. Results of tilted domes differ by 1 to 2 cm, 0.2 deg."""
+_PLACE_DOF = 3.0  # of that prior: one place
+GUESS_SIGMAS = np.repeat([np.radians(10.0), 1.0], 3)
+"""(6,) [rad, m] of a direction that no plane determines."""
+_EXACT = 1e-18  # [m^2, rad^2] least variance, for rounding
+_SETTLED, _MOST_STEPS = 0.01, 50  # of REML
+
+Clouds = Mapping[str, Sequence[Array]]
+"""Per LiDAR its clouds (n, 3+) in its own frame [m], one of each instant; the same instants."""
+
+
+@dataclass(frozen=True, eq=False)
+class LidarPoses:
+    """LiDARs relative to the base.
+
+    Attributes:
+        base: its name.
+        T_base_lidar: per LiDAR, (4, 4): p_base = T_base_lidar * p_lidar.
+        covariance: per LiDAR but the base, (6, 6) of xi = (rotation [rad], translation [m]) in the
+            base's axes: R = exp(rotation) R_estimate, t = t_estimate + translation, t being the
+            position of the LiDAR.
+        joint_covariance: (6 k, 6 k) of them all, in their order.
+        matched: per LiDAR, the share of its planes near others' that lie on them (0-1).
+        places: instants between which the vehicle has moved.
+        place_ratios: variance of rotation and translation between places over its prior.
+    """
+
+    base: str
+    T_base_lidar: Mapping[str, Array]
+    covariance: Mapping[str, Array]
+    joint_covariance: Array
+    matched: Mapping[str, float]
+    places: int
+    place_ratios: tuple[float, float]
+
+
+def calibrate_lidars(clouds: Clouds, T_base_lidar: Mapping[str, Array], *, base: str) -> LidarPoses:
+    """The poses of LiDARs from what they see in common, at all instants at once.
+
+    The vehicle stands at each instant, or the clouds have been brought to one time. Of instants
+    between which it has not moved the first is taken: their errors are the same.
+
+    Args:
+        clouds: of at least two LiDARs, the base among them.
+        T_base_lidar: (4, 4) the guess of each but the base, within some 5 degrees and half a metre.
+        base: name of the LiDAR in whose frame the others are.
+
+    Raises:
+        CalibrationError: if LiDARs see too little in common.
+        ValueError: if names or counts of clouds do not fit.
+    """
+    names = [base, *(name for name in clouds if name != base)]
+    _require_alike(clouds, T_base_lidar, names)
+    planes = [[find_planes(cloud) for cloud in clouds[name]] for name in names]
+    kept = _distinct(planes[0])
+    planes = [[of[i] for i in kept] for of in planes]
+    T = np.array([np.eye(4), *(np.asarray(T_base_lidar[name], np.float64) for name in names[1:])])
+    T, _ = refine_poses(planes, T, names)
+    places = [_at_place([of[i : i + 1] for of in planes], T, names) for i in range(len(planes[0]))]
+    step, joint, ratios = _over_places(places)
+    T = _moved(T, step)
+    near, on = count_matched(planes, T)
+    rows = [slice(6 * row, 6 * row + 6) for row in range(len(names) - 1)]
+    return LidarPoses(
+        base,
+        dict(zip(names, T, strict=True)),
+        {name: joint[of, of] for name, of in zip(names[1:], rows, strict=True)},
+        joint,
+        dict(zip(names, (on / near).tolist(), strict=True)),
+        len(places),
+        ratios,
+    )
+
+
+def refine_poses(
+    planes: Sequence[Sequence[Planes]],
+    T_base_lidar: Array,
+    names: Sequence[str],
+    *,
+    first: int = 0,
+    rounds: int = _MOST_ROUNDS,
+) -> tuple[Array, Sums]:
+    """The (k, 4, 4) poses at which planes fit best, and the sums there; the base is the first.
+
+    Raises:
+        CalibrationError: if a LiDAR has too few matches.
+    """
+    T = T_base_lidar
+    for number in range(first, rounds):
+        is_last = number >= len(_GATES_M)
+        gate_m = _LAST_GATE_M if is_last else _GATES_M[number]
+        matches = _match(planes, T, gate_m, _FINE_COSINE if number > 1 else _COARSE_COSINE)
+        _require_overlap(matches, names)
+        sums = sum_up(matches, T, _scale_m(matches, 0.0 if is_last else _WIDTH * gate_m))
+        step = _step(sums)
+        T = _moved(T, step)
+        if is_last and np.abs(step).max() < _CONVERGED:
+            break
+    return T, sums
+
+
+def _distinct(planes: Sequence[Planes]) -> list[int]:
+    """The instants of which the base sees upright planes elsewhere than at those before."""
+    kept: list[int] = []
+    for number, own in enumerate(planes):
+        up = np.linalg.eigh(own.normals.T @ own.normals)[1][:, 2]  # most planes are ground
+        stands = False
+        for other in kept:
+            near, on = count_matched([[planes[other]], [own]], np.array([np.eye(4)] * 2), up=up)
+            stands |= bool(on[0] > _STANDS * max(near[0], 1.0))
+        if not stands:
+            kept.append(number)
+    return kept
+
+
+def _require_alike(clouds: Clouds, guess: Mapping[str, Array], names: Sequence[str]) -> None:
+    if names[0] not in clouds or len(names) == 1:
+        raise ValueError(f"clouds of {', '.join(clouds)}: of the base {names[0]} and another")
+    if missing := [name for name in names[1:] if name not in guess]:
+        raise ValueError(f"T_base_lidar has no guess of {', '.join(missing)}")
+    counts = {name: len(clouds[name]) for name in names}
+    if len({*counts.values()}) > 1:
+        raise ValueError(f"clouds of the same instants are needed; found {counts}")
+
+
+def _moved(T_base_lidar: Array, steps: Array) -> Array:
+    """(k, 4, 4) poses after (6 (k - 1),) steps of all but the base."""
+    T = T_base_lidar.copy()
+    for pose, step in zip(T[1:], steps.reshape(-1, 6), strict=True):
+        pose[:3, :3] = Rotation.from_rotvec(step[:3]).as_matrix() @ pose[:3, :3]
+        pose[:3, 3] += step[3:]
+    return T
+
+
+def _match(
+    planes: Sequence[Sequence[Planes]], T_base_lidar: Array, gate_m: float, cosine: float
+) -> list[Matches]:
+    """Each plane with the nearest one of every other LiDAR, if that can be the same."""
+    found = []
+    for place, one, other, of, to in _nearest(planes, T_base_lidar):
+        apart = of.centers_m - to.centers_m
+        across = (to.normals * apart).sum(axis=1)
+        along = np.sqrt(np.maximum((apart**2).sum(axis=1) - across**2, 0.0))
+        same = (along < np.maximum(of.radii_m, to.radii_m)) & (np.abs(across) < gate_m)
+        same &= (of.normals * to.normals).sum(axis=1) > cosine
+        if same.any():
+            found.append(Matches(place, one, other, of.select(same), to.select(same)))
+    return found
+
+
+def _nearest(
+    planes: Sequence[Sequence[Planes]], T_base_lidar: Array
+) -> Iterator[tuple[int, int, int, Planes, Planes]]:
+    """Per place and ordered pair of LiDARs, planes of one and the nearest of the other in reach."""
+    for place, seen in enumerate(zip(*planes, strict=True)):
+        here = [own.moved(T) for own, T in zip(seen, T_base_lidar, strict=True)]
+        trees = [cKDTree(own.centers_m) if len(own) else None for own in here]
+        for one, other in permutations(range(len(here)), 2):
+            tree, of, to = trees[other], here[one], here[other]
+            if tree is None or not len(of):
+                continue
+            away, nearest = tree.query(of.centers_m, distance_upper_bound=_REACH_M)
+            rows = np.flatnonzero(np.isfinite(away))
+            yield place, one, other, of.select(rows), to.select(nearest[rows])
+
+
+def count_matched(
+    planes: Sequence[Sequence[Planes]], T_base_lidar: Array, *, up: Array | None = None
+) -> tuple[Array, Array]:
+    """Per LiDAR (k,): planes whose centre another's plane is near, and how many lie on it.
+
+    With (3,) ``up`` in the base frame only those that are upright.
+    """
+    near, on = np.zeros(len(T_base_lidar)), np.zeros(len(T_base_lidar))
+    for _, one, other, of, to in _nearest(planes, T_base_lidar):
+        apart = of.centers_m - to.centers_m
+        beside = (apart**2).sum(axis=1) < np.maximum(of.radii_m, to.radii_m) ** 2
+        if up is not None:
+            beside &= np.abs(of.normals @ up) < _UPRIGHT
+        across = np.abs((to.normals * apart).sum(axis=1)) < _LAST_GATE_M
+        on_it = beside & across & ((of.normals * to.normals).sum(axis=1) > _FINE_COSINE)
+        for number in (one, other):
+            near[number] += beside.sum()
+            on[number] += on_it.sum()
+    return near, on
+
+
+def _require_overlap(matches: Sequence[Matches], names: Sequence[str]) -> None:
+    """One line if a LiDAR has too few matches."""
+    for number, name in enumerate(names):
+        count = sum(len(own.planes) for own in matches if number in (own.one, own.other))
+        if count < _LEAST_MATCHES:
+            raise CalibrationError(
+                f"LiDAR {name!r} sees {count} planes that others see, at least {_LEAST_MATCHES} "
+                "are needed; check its guess T_base_lidar (p_base = T_base_lidar * p_lidar), or "
+                "record where walls and ground are in view of both"
+            )
+
+
+def _scale_m(matches: Sequence[Matches], least_m: float) -> float:
+    """Width of the Cauchy loss: as residuals spread."""
+    every = np.concatenate([own.residuals_m[0] for own in matches])
+    return max(2.0 * 1.4826 * float(np.median(np.abs(every))), _LEAST_SCALE_M, least_m)
+
+
+def _step(sums: Sums) -> Array:
+    """(d,) Gauss-Newton, along what is determined."""
+    basis = sums.basis()
+    hessian = basis.T @ sums.hessian.sum(axis=0) @ basis
+    return np.asarray(-basis @ np.linalg.solve(hessian, basis.T @ sums.gradient.sum(axis=0)))
+
+
+def _at_place(
+    planes: Sequence[Sequence[Planes]], T_base_lidar: Array, names: Sequence[str]
+) -> tuple[Array, Array]:
+    """(d, d) I_p and (d,) I_p (theta + u_p) of one place, in steps from poses near its optimum.
+
+    The place is fitted alone. The scatter S_p is of its cells there, each with the weight of
+    leaving it out (the jackknife): a direction that hangs by one cell is determined by none. A
+    place with too few matches has no information.
+    """
+    size = 6 * (len(names) - 1)
+    try:
+        T, sums = refine_poses(planes, T_base_lidar, names, first=_AT_PLACE)
+    except CalibrationError:
+        return np.zeros((size, size)), np.zeros(size)
+    basis = sums.basis()
+    whole = sums.hessian.sum(axis=0) @ basis  # (d, q)
+    hessian, cells = basis.T @ whole, basis.T @ sums.hessian @ basis
+    gradients = (sums.gradient @ basis)[:, :, None]
+    apart = np.linalg.solve(hessian - cells, gradients)[:, :, 0]  # of a fit without the cell
+    root = np.linalg.cholesky(_shrunk(apart, hessian) + _EXACT * np.eye(len(hessian)))
+    seen = np.linalg.solve(hessian, whole.T)
+    by = scipy.linalg.solve_triangular(root, seen, lower=True)  # (q, d)
+    return by.T @ by, by.T @ by @ _steps_between(T_base_lidar, T)
+
+
+def _shrunk(apart: Array, hessian: Array) -> Array:
+    """(q, q) covariance by the (n, q) deviations of fits without each cell.
+
+    Of few cells its smallest eigenvalues are far too small. So it is shrunk towards that of
+    independent residuals, H^-1, of the same mean size, which counts as twice as many cells as there
+    are directions.
+    """
+    size, inverse = len(hessian), np.linalg.inv(hessian)
+    each = np.einsum("ni,ij,nj->n", apart, hessian, apart)
+    cells = each.sum() ** 2 / max(float((each**2).sum()), float(np.finfo(float).tiny))
+    model = each.sum() / size * (inverse + inverse.T) / 2
+    return np.asarray((cells * apart.T @ apart + 2 * size * model) / (cells + 2 * size))
+
+
+def _steps_between(T_base_lidar: Array, others: Array) -> Array:
+    """(d,) the steps of all but the base from (k, 4, 4) poses to others."""
+    turns = others[1:, :3, :3] @ T_base_lidar[1:, :3, :3].transpose(0, 2, 1)
+    shifts = others[1:, :3, 3] - T_base_lidar[1:, :3, 3]
+    return np.column_stack([Rotation.from_matrix(turns).as_rotvec(), shifts]).ravel()
+
+
+def _over_places(
+    places: Sequence[tuple[Array, Array]],
+) -> tuple[Array, Array, tuple[float, float]]:
+    """(d,) step to the optimum over places, its (d, d) covariance, and the ratios of D."""
+    informations, vectors = map(np.array, zip(*places, strict=True))
+    size = len(vectors[0])
+    is_turn = np.tile([True] * 3 + [False] * 3, size // 6)
+    prior = np.tile(PLACE_SIGMAS**2, size // 6)
+    guess = np.tile(GUESS_SIGMAS**-2.0, size // 6)
+    ratios = np.ones(2)
+    for _ in range(_MOST_STEPS):
+        variance = prior * np.where(is_turn, *ratios)
+        at_place = np.linalg.inv(informations + np.diag(1.0 / variance))
+        gain = at_place @ informations
+        known = (informations - informations @ gain).sum(axis=0) + np.diag(guess)
+        vector = (vectors - (informations @ (at_place @ vectors[:, :, None]))[:, :, 0]).sum(axis=0)
+        joint = np.linalg.inv(known)
+        step = joint @ vector
+        apart = (at_place @ (vectors - informations @ step)[:, :, None])[:, :, 0]
+        open_ = np.einsum("pii->pi", at_place + gain @ joint @ gain.transpose(0, 2, 1))
+        before, ratios = ratios, np.array([
+            (_PLACE_DOF + float((apart[:, own] ** 2 / prior[own]).sum()))
+            / (_PLACE_DOF + float((1.0 - open_[:, own] / variance[own]).sum()))
+            for own in (is_turn, ~is_turn)
+        ])  # fmt: skip
+        if np.abs(np.log(ratios / before)).max() < _SETTLED:
+            break
+    return step, (joint + joint.T) / 2, (float(ratios[0]), float(ratios[1]))

@@ -1,0 +1,126 @@
+"""Planes that a LiDAR's points lie on, from neighbourhoods wider than the spacing of its rings.
+
+Points of two LiDARs never coincide, and their rings attract each other: nearest points pull a pose
+towards where rings lie upon rings. The mean of points of a plane lies on that plane, wherever they
+were measured, if they spread in two directions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from calibgraph.arrays import Array
+
+_NEAREST_M, _FARTHEST_M = 1.0, 80.0  # the vehicle itself, and where planes are too few to match
+_SHARES = (0.04, 0.08, 0.16)  # radii of neighbourhoods over the range, in turn until one spreads
+_LEAST_M, _LARGEST_M = 0.3, 4.0  # of a radius
+_MOST = 5000  # planes of a cloud: of more, the residuals repeat each other
+_POINTS = 10  # of a plane, at least
+_ASPECT = 0.15  # least variance along a plane over the largest: of a single ring it is far smaller
+_SPREAD = 0.04  # of the same over the squared radius
+_FLAT, _ROUGH_M = 0.01, 0.08  # most variance across a plane over the least along it; most roughness
+
+
+@dataclass(frozen=True, eq=False)
+class Planes:
+    """Pieces of planes.
+
+    Attributes:
+        centers_m: (n, 3) means of their points.
+        normals: (n, 3) unit vectors, towards the LiDAR.
+        radii_m: (n,) of the neighbourhoods.
+        tilts: (n,) by how much a normal may err [rad]: roughness over the least extent.
+    """
+
+    centers_m: Array
+    normals: Array
+    radii_m: Array
+    tilts: Array
+
+    def __len__(self) -> int:
+        return len(self.radii_m)
+
+    def select(self, rows: NDArray[Any]) -> Planes:
+        """Some of them: a mask, or an index array."""
+        return Planes(
+            self.centers_m[rows], self.normals[rows], self.radii_m[rows], self.tilts[rows]
+        )
+
+    def moved(self, T_base_lidar: Array) -> Planes:
+        """The same in another frame, by (4, 4)."""
+        R = T_base_lidar[:3, :3]
+        centers = self.centers_m @ R.T + T_base_lidar[:3, 3]
+        return replace(self, centers_m=centers, normals=self.normals @ R.T)
+
+
+_NONE = Planes(np.empty((0, 3)), np.empty((0, 3)), np.empty(0), np.empty(0))
+
+
+def find_planes(points_lidar_m: Array) -> Planes:
+    """The planes of a cloud, (n, 3) or more columns, of which the first three are x y z.
+
+    A neighbourhood grows with the range, and further where its points do not spread in two
+    directions, as those of a ring on the ground; where they spread and are not flat, it is dropped.
+    """
+    points = np.asarray(points_lidar_m[:, :3], dtype=np.float64)
+    ranges = np.linalg.norm(points, axis=1)
+    points = points[(ranges > _NEAREST_M) & (ranges < _FARTHEST_M)]
+    left, found, tree = _seeds(points), [_NONE], None
+    for share in _SHARES:
+        if not len(left):
+            break
+        tree = tree or cKDTree(points)
+        radii = np.clip(share * np.linalg.norm(left, axis=1), _LEAST_M, _LARGEST_M)
+        own, is_plane, spreads = _fit(points, tree.query_ball_point(left, radii), radii)
+        found.append(own.select(is_plane))
+        left = left[~spreads]
+    return join_planes(found)
+
+
+def join_planes(parts: Sequence[Planes]) -> Planes:
+    """All planes of several clouds, in one frame."""
+    fields = zip(
+        *([getattr(each, key) for key in Planes.__annotations__] for each in parts), strict=True
+    )
+    return Planes(*map(np.concatenate, fields))
+
+
+def _seeds(points: Array) -> Array:
+    """(s, 3) points, one of each cell, whose size grows with the range; of many, a selection."""
+    size = np.clip(_SHARES[0] * np.linalg.norm(points, axis=1), 0.25, 1.0)
+    steps = np.round(2 * np.log2(size))
+    cells = np.column_stack([steps, np.floor(points / 2 ** (steps / 2)[:, None])]).astype(np.int64)
+    first = np.unique(cells, axis=0, return_index=True)[1]
+    step = -(-len(first) // _MOST)
+    return np.asarray(points[first[:: step or 1]])
+
+
+def _fit(
+    points: Array, near: NDArray[Any], radii: Array
+) -> tuple[Planes, NDArray[np.bool_], NDArray[np.bool_]]:
+    """The planes of neighbourhoods; (s,) which are planes, and which spread in two directions."""
+    counts = np.fromiter(map(len, near), np.int64, len(near))
+    of, rows = np.repeat(np.arange(len(near)), counts), np.concatenate([*near]).astype(np.int64)
+    each = np.maximum(counts, 1)[:, None]
+
+    def mean(values: Array) -> Array:
+        sums = [np.bincount(of, column, len(near)) for column in values.T]
+        return np.asarray(np.column_stack(sums) / each)
+
+    centers = mean(points[rows])
+    apart = points[rows] - centers[of]
+    squares = mean((apart[:, :, None] * apart[:, None, :]).reshape(-1, 9)).reshape(-1, 3, 3)
+    variances, vectors = np.linalg.eigh(squares)
+    across, least, largest = variances.T
+    spreads = (counts >= _POINTS) & (least > _ASPECT * largest) & (least > _SPREAD * radii**2)
+    is_plane = spreads & (across < _FLAT * least) & (across < _ROUGH_M**2)
+    normals = vectors[:, :, 0]
+    normals = normals * np.where((normals * centers).sum(axis=1) > 0, -1.0, 1.0)[:, None]
+    tilts = np.sqrt(np.maximum(across, 0.0) / np.maximum(least, np.finfo(float).tiny))
+    return Planes(centers, normals, radii, tilts), is_plane, spreads

@@ -1,0 +1,213 @@
+"""Where LiDARs are, roughly: by the ground that each sees, and by upright things from above.
+
+The ground gives the direction up and the height of each LiDAR. Then two clouds differ by a heading
+and a shift, of which all are tried: the images of upright things from above are correlated, heading
+by heading. The likeliest are refined by planes, and the one whose upright planes agree best is
+taken.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import product
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from calibgraph.arrays import Array
+from calibgraph.errors import CalibrationError
+from calibgraph.matching.cloud_similarity import find_ground
+from calibgraph.model.geometry import invert
+from calibgraph.vehicle.lidars import Clouds, count_matched, refine_poses
+from calibgraph.vehicle.planes import Planes, find_planes, join_planes
+
+_CELLS, _CELL_M = 192, 0.5  # of an image from above
+_FROM_M, _TO_M = 0.4, 6.0  # over the ground: what is upright
+_STEP_DEG = 3.0  # between headings
+_APART_M = 12.0  # of two LiDARs of one vehicle
+_NEAR_DEG, _NEAR_M = 35.0, 2.5  # of a guess
+_TRIED = 6  # placements that are refined
+_INSTANTS = 3  # that are looked at
+_LEAST_ON, _LEAST_SHARE = 15, 0.7
+"""Upright planes that lie on another's, and their share of those near one. Of two vehicles (carla,
+opencalib) right placements have 18 and more, 0.75 and more, but for one of 6; clouds of two places
+have up to 11, and with more than 5 up to 1.0."""
+_ROUNDS, _MOST_PLANES = 9, 2000  # of refining
+_PEAK_M = 1.5  # about one that has been tried
+_UPS = np.array([up for up in product((-1.0, 0.0, 1.0), repeat=3) if any(up)])
+
+
+class _Seen(NamedTuple):
+    """What a LiDAR sees at some instants: clouds (n, 3), planes; and (4, 4) T_up_lidar."""
+
+    clouds: Sequence[Array]
+    planes: Sequence[Planes]
+    T_up_lidar: Array
+
+
+class _Placement(NamedTuple):
+    """Upright planes that lie on others', their share of those near one, (4, 4) T_base_lidar."""
+
+    on: int
+    share: float
+    T: Array
+
+    @property
+    def is_sure(self) -> bool:
+        return self.on >= _LEAST_ON and self.share >= _LEAST_SHARE
+
+
+_Placed = Mapping[str, tuple[_Seen, Array]]
+"""LiDARs whose (4, 4) T_base_lidar is known."""
+
+
+def locate_lidars(
+    clouds: Clouds, guess: Mapping[str, Array | None], *, base: str
+) -> dict[str, Array]:
+    """Rough (4, 4) T_base_lidar of each LiDAR but the base.
+
+    Args:
+        clouds: as of :func:`calibgraph.vehicle.lidars.calibrate_lidars`.
+        guess: per LiDAR but the base (4, 4), within some 30 degrees and 2 metres; None if unknown.
+        base: whose frame it is.
+
+    Raises:
+        CalibrationError: if a LiDAR has no ground, or shares too little with those that are placed.
+    """
+    chosen = np.unique(np.linspace(0, len(clouds[base]) - 1, _INSTANTS).round().astype(int))
+    seen = {name: _look(name, [of[i] for i in chosen]) for name, of in clouds.items()}
+    placed, left = {base: (seen[base], np.eye(4))}, [name for name in clouds if name != base]
+    while left:
+        found = {}
+        for name in left:
+            starts = _placements(seen[name], placed, seen[base].T_up_lidar, guess[name])
+            found[name] = _best(seen[name], placed, starts, seen[base].T_up_lidar[2, :3])
+        _require_one(found, [*placed])
+        placed |= {name: (seen[name], of.T) for name, of in found.items() if of.is_sure}
+        left = [name for name in left if name not in placed]
+    return {name: T for name, (_, T) in placed.items() if name != base}
+
+
+def _require_one(found: Mapping[str, _Placement], placed: Sequence[str]) -> None:
+    if any(each.is_sure for each in found.values()):
+        return
+    name = max(found, key=lambda each: found[each].on)
+    raise CalibrationError(
+        f"LiDAR {name!r} shares too little with {', '.join(placed)}: {found[name].on} upright "
+        f"planes lie on theirs, {found[name].share:.0%} of those near one; at least {_LEAST_ON} "
+        f"and {_LEAST_SHARE:.0%} are needed: record where walls, poles or cars are in view of "
+        "both, or write its T_base_lidar into rig.yaml"
+    )
+
+
+def _look(name: str, clouds: Sequence[Array]) -> _Seen:
+    points = [np.asarray(cloud[:, :3], np.float64) for cloud in clouds]
+    planes = [find_planes(cloud) for cloud in points]
+    some = [of.select(np.arange(0, len(of), max(-(-len(of) // _MOST_PLANES), 1))) for of in planes]
+    return _Seen(points, some, find_upright(name, points))
+
+
+def find_upright(name: str, clouds: Sequence[Array]) -> Array:
+    """(4, 4) T_up_lidar: z up, 0 on the ground; by all instants together."""
+    cloud = np.concatenate(clouds)
+    share, height_m, normal = max(
+        (find_ground(cloud, up / np.linalg.norm(up)) for up in _UPS), key=lambda ground: ground[0]
+    )
+    if share == 0.0:
+        raise CalibrationError(
+            f"LiDAR {name!r} sees no ground, by which its placement is found; write its "
+            "T_base_lidar into rig.yaml"
+        )
+    T = np.eye(4)
+    T[:3, :3] = Rotation.align_vectors([[0.0, 0.0, 1.0]], normal[None])[0].as_matrix()
+    T[2, 3] = height_m
+    return T
+
+
+def _placements(own: _Seen, placed: _Placed, T_up_base: Array, guess: Array | None) -> list[Array]:
+    """Likely (4, 4) T_base_lidar: the guess, and by the images from above."""
+    headings, offsets, score = _correlate(own, placed, T_up_base)
+    starts = [] if guess is None else [guess]
+    if guess is not None:  # only near it
+        T = T_up_base @ guess @ invert(own.T_up_lidar)
+        turned = headings - np.degrees(np.arctan2(T[1, 0], T[0, 0]))
+        score[np.abs((turned + 180.0) % 360.0 - 180.0) > _NEAR_DEG] = -np.inf
+        at = (T_up_base @ guess)[:2, 3]
+        score[:, np.linalg.norm(offsets - at, axis=-1) > _NEAR_M] = -np.inf
+    while len(starts) < _TRIED and np.isfinite(score.max()):
+        turn, i, j = np.unravel_index(int(score.argmax()), score.shape)
+        T = _turn(headings[turn])
+        T[:2, 3] = offsets[i, j]
+        starts.append(invert(T_up_base) @ T @ own.T_up_lidar)
+        apart = np.abs((headings - headings[turn] + 180.0) % 360.0 - 180.0)
+        near = np.linalg.norm(offsets - offsets[i, j], axis=-1) <= _PEAK_M
+        score[np.ix_(apart <= 2 * _STEP_DEG, near.any(axis=1), near.any(axis=0))] = -np.inf
+    return starts
+
+
+def _correlate(own: _Seen, placed: _Placed, T_up_base: Array) -> tuple[Array, Array, Array]:
+    """(h,) headings [deg], (c, c, 2) positions of the LiDAR [m], (h, c, c) how well they fit."""
+    known, upright = [], []
+    for instant, cloud in enumerate(own.clouds):
+        clouds = [_moved(of.clouds[instant], T_up_base @ T) for of, T in placed.values()]
+        known.append(np.fft.rfft2(_from_above(_upright_points(np.concatenate(clouds)))))
+        upright.append(_upright_points(_moved(cloud, own.T_up_lidar)))
+    maps, headings = [], np.arange(0.0, 360.0, _STEP_DEG)
+    for heading in headings:
+        products = [
+            one * np.fft.rfft2(_from_above(_moved(two, _turn(heading)))).conj()
+            for one, two in zip(known, upright, strict=True)
+        ]
+        maps.append(np.fft.irfft2(np.sum(products, axis=0)))
+    score = np.fft.fftshift(np.array(maps), axes=(1, 2))
+    steps = (np.arange(_CELLS) - _CELLS // 2) * _CELL_M
+    offsets = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1)
+    score[:, np.linalg.norm(offsets, axis=-1) > _APART_M] = -np.inf
+    return headings, offsets, score
+
+
+def _turn(heading_deg: float) -> Array:
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_euler("z", heading_deg, degrees=True).as_matrix()
+    return T
+
+
+def _moved(points: Array, T: Array) -> Array:
+    return np.asarray(points @ T[:3, :3].T + T[:3, 3])
+
+
+def _upright_points(points_up_m: Array) -> Array:
+    """(n, 3) points over the ground, one of each voxel."""
+    points = points_up_m[(points_up_m[:, 2] > _FROM_M) & (points_up_m[:, 2] < _TO_M)]
+    points = points[np.hypot(points[:, 0], points[:, 1]) < _CELLS * _CELL_M / 2]
+    i, j, k = np.floor(points / _CELL_M).astype(np.int64).T + 2 * _CELLS
+    return points[np.unique((i * 4 * _CELLS + j) * 4 * _CELLS + k, return_index=True)[1]]
+
+
+def _from_above(points_m: Array) -> Array:
+    """(_CELLS, _CELLS) how much is in each cell, blurred; of mean 0 and unit norm."""
+    i, j = np.floor(points_m[:, :2] / _CELL_M).astype(np.int64).T + _CELLS // 2
+    inside = (i >= 0) & (i < _CELLS) & (j >= 0) & (j < _CELLS)
+    counts = np.bincount(i[inside] * _CELLS + j[inside], minlength=_CELLS**2).astype(np.float64)
+    image = np.asarray(cv2.GaussianBlur(np.sqrt(counts).reshape(_CELLS, _CELLS), (0, 0), 1.0))
+    image -= image.mean()
+    return np.asarray(image / max(float(np.linalg.norm(image)), float(np.finfo(float).tiny)))
+
+
+def _best(own: _Seen, placed: _Placed, starts: Sequence[Array], up: Array) -> _Placement:
+    """Of refined starts the one whose upright planes agree best; ``up`` in the base frame."""
+    known = [
+        join_planes([of.planes[i].moved(T) for of, T in placed.values()])
+        for i in range(len(own.planes))
+    ]
+    both, results = [known, own.planes], [_Placement(0, 0.0, np.eye(4))]
+    for start in starts:
+        try:
+            T, _ = refine_poses(both, np.array([np.eye(4), start]), ("base", ""), rounds=_ROUNDS)
+        except CalibrationError:  # hardly anything in common there
+            continue
+        near, on = (float(count[1]) for count in count_matched(both, T, up=up))
+        results.append(_Placement(int(on), on / max(near, 1.0), T[1]))
+    return max(results, key=lambda found: found.on * found.share)

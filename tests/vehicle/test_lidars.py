@@ -1,0 +1,166 @@
+"""LiDARs by planes: the truth, error bars, what is flat, what moved, what does not overlap."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from calibgraph.arrays import Array
+from calibgraph.errors import CalibrationError
+from calibgraph.model.geometry import transform
+from calibgraph.model.verdict import TOLERANCE
+from calibgraph.vehicle.lidars import PLACE_SIGMAS, LidarPoses, calibrate_lidars
+from calibgraph.vehicle.planes import find_planes
+from calibgraph.vehicle.rig import judge_lidar
+from calibgraph.vehicle.start import locate_lidars
+from tests.vehicle.scenes import HEIGHT_M, MOUNTS, draw_place, flat_street, record, scan
+
+UPSIDE_DOWN = transform(
+    Rotation.from_euler("xyz", [180.0, 10.0, 30.0], degrees=True), [1.0, 0.3, 0.0]
+)
+
+
+def displaced(T: Array, seed: int, deg: float, metres: float) -> Array:
+    """A pose turned and shifted by so much, in random directions."""
+    turn, shift = np.random.default_rng(seed).normal(size=(2, 3))
+    turn, shift = (each / np.linalg.norm(each) for each in (turn, shift))
+    R = Rotation.from_rotvec(np.radians(deg) * turn).as_matrix()
+    return transform(R @ T[:3, :3], T[:3, 3] + metres * shift)
+
+
+def errors(found: LidarPoses, name: str, truth: Array) -> Array:
+    """(6,) of the result, as its covariance has them."""
+    T = found.T_base_lidar[name]
+    rotation = Rotation.from_matrix(T[:3, :3] @ truth[:3, :3].T).as_rotvec()
+    return np.concatenate([rotation, T[:3, 3] - truth[:3, 3]])
+
+
+def sigmas(found: LidarPoses, name: str) -> Array:
+    return np.sqrt(np.diag(found.covariance[name]))
+
+
+def test_poses_are_found_without_a_guess_upside_down_too():
+    mounts = {"top": MOUNTS["top"], "left": MOUNTS["left"], "down": UPSIDE_DOWN}
+    clouds = record(1, places=2, mounts=mounts)
+    start = locate_lidars(clouds, {"left": None, "down": None}, base="top")
+    found = calibrate_lidars(clouds, start, base="top")
+    for name in ("left", "down"):
+        off = np.abs(errors(found, name, mounts[name]))
+        # wanted of ten places: 0.02 deg, 0.4 cm
+        assert off[:3].max() < np.radians(0.02) and off[3:].max() < 0.004, name
+        assert (off < 3 * sigmas(found, name)).all(), name
+        assert found.matched[name] > 0.95
+
+
+def test_a_start_20_degrees_off_ends_where_a_near_one_does():
+    clouds = record(2, places=2)
+    ends = []
+    for deg, metres in ((20.0, 0.5), (1.0, 0.05)):
+        guess = {n: displaced(MOUNTS[n], 3, deg, metres) for n in ("front", "left")}
+        start = locate_lidars(clouds, guess, base="top") if deg > 5 else guess
+        ends.append(calibrate_lidars(clouds, start, base="top"))
+    for name in ("front", "left"):
+        # both stop at steps of 1e-6, about one optimum
+        np.testing.assert_allclose(*(end.T_base_lidar[name] for end in ends), atol=1e-4)
+
+
+def test_a_flat_street_leaves_the_direction_along_it_open():
+    clouds = record(3, places=2, street=True)
+    guess = {name: displaced(MOUNTS[name], 4, 0.5, 0.05) for name in ("front", "left")}
+    found = calibrate_lidars(clouds, guess, base="top")
+    for name in ("front", "left"):
+        bar = sigmas(found, name)
+        assert bar[3] > 0.3, "along the street nothing is known"
+        assert (bar[4:] < 0.02).all() and (bar[:3] < np.radians(0.15)).all()
+        off = np.abs(errors(found, name, MOUNTS[name]))
+        assert (off < 3 * bar).all()
+        verdict = judge_lidar(found, name, TOLERANCE)
+        assert verdict.status == "WARN" and verdict.cannot_tell
+        assert "determines x in top: the guess stays" in " ".join(verdict.reasons)
+
+
+def test_places_that_differ_widen_the_error_bar_and_places_that_agree_narrow_it():
+    turn, shift = PLACE_SIGMAS[0], PLACE_SIGMAS[3]
+    ratios = {}
+    for factor in (0.0, 1.0, 2.0):
+        clouds = record(5, places=3, scatter=(factor * turn, factor * shift))
+        found = calibrate_lidars(clouds, MOUNTS, base="top")
+        ratios[factor] = found.place_ratios
+        for name in ("front", "left"):
+            off = np.abs(errors(found, name, MOUNTS[name]))
+            assert (off < 3.5 * sigmas(found, name)).all(), factor
+    for kind in (0, 1):
+        assert ratios[0.0][kind] < 0.3 < ratios[1.0][kind] < ratios[2.0][kind]
+        assert ratios[2.0][kind] > 2.0
+
+
+def test_instants_in_which_the_vehicle_stands_count_once():
+    rng, boxes = np.random.default_rng(9), draw_place(np.random.default_rng(1))
+    ats = [transform(np.eye(3), [x, 0.0, HEIGHT_M]) for x in (0.0, 0.0, 5.0, 0.0)]
+    clouds = {n: [scan(boxes, at @ MOUNTS[n], rng) for at in ats] for n in ("top", "front")}
+    assert calibrate_lidars(clouds, MOUNTS, base="top").places == 2
+
+
+def test_a_lidar_that_moved_between_places_shows_in_what_places_differ_by():
+    T = MOUNTS["left"].copy()
+    T[1, 3] += 0.15
+    found = calibrate_lidars(record(6, places=4, moved={"left": T}), MOUNTS, base="top")
+    assert found.place_ratios[1] > 2.0**2  # the limit of PASS, as a variance
+
+
+def test_clouds_that_share_nothing_are_refused_with_their_share():
+    clouds, rng = record(7, places=1), np.random.default_rng(8)
+    elsewhere = draw_place(rng, boxes=6, fronts=False)
+    at = transform(np.eye(3), [0.0, 0.0, HEIGHT_M])
+    clouds["left"] = [scan(elsewhere, at @ MOUNTS["left"], rng)]
+    with pytest.raises(CalibrationError, match=r"LiDAR 'left' shares too little with top.*%"):
+        locate_lidars(clouds, {"front": None, "left": None}, base="top")
+    clouds["left"] = [np.array([[5.0, y, z] for y in range(9) for z in range(9)])]
+    with pytest.raises(CalibrationError, match="LiDAR 'left' sees no ground"):
+        locate_lidars(clouds, {"front": None, "left": None}, base="top")
+    with pytest.raises(CalibrationError, match="'left' sees 0 planes that others see"):
+        calibrate_lidars(clouds, MOUNTS, base="top")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"base": "roof"}, "of the base roof and another"),
+        ({"guess": {}}, "no guess of front, left"),
+        ({"less": "left"}, "same instants"),
+    ],
+)
+def test_wrong_arguments_are_named(change, message):
+    clouds = {name: [np.zeros((1, 3))] * 2 for name in MOUNTS}
+    if "less" in change:
+        clouds[change["less"]] = clouds[change["less"]][:1]
+    with pytest.raises(ValueError, match=message):
+        calibrate_lidars(clouds, change.get("guess", MOUNTS), base=change.get("base", "top"))
+
+
+def test_the_centre_of_a_plane_lies_on_it_and_single_rings_are_no_planes():
+    rng = np.random.default_rng(0)
+    cloud = scan(flat_street(), transform(np.eye(3), [0.0, 0.0, 1.8]), rng, noise_m=0.0)
+    planes = find_planes(cloud)
+    ground = np.abs(planes.normals[:, 2]) > 0.9
+    assert ground.any() and not ground.all()
+    off = np.abs(planes.centers_m[:, 2] + 1.8), np.abs(np.abs(planes.centers_m[:, 1]) - 8.0)
+    assert np.mean(np.minimum(*off) < 1e-6) > 0.9, "but for those in the corner of both"
+    ring = np.column_stack(
+        [*(5 * f(np.linspace(0, 6, 500)) for f in (np.cos, np.sin)), -np.ones(500)]
+    )
+    assert not len(find_planes(ring))
+
+
+@pytest.mark.slow
+@pytest.mark.statistics
+def test_error_bars_are_as_wide_as_errors_scatter():
+    turn, shift = PLACE_SIGMAS[0], PLACE_SIGMAS[3]
+    nees = []
+    for seed in range(12):
+        clouds = record(100 + seed, places=5, scatter=(turn, shift))
+        found = calibrate_lidars(clouds, MOUNTS, base="top")
+        for name in ("front", "left"):
+            off = errors(found, name, MOUNTS[name])
+            nees.append(off @ np.linalg.solve(found.covariance[name], off) / 6)
+    # the mean of 144 squares has a deviation of sqrt(2 / 144) = 0.12, and sizes are estimated
+    assert 0.6 < np.mean(nees) < 1.5

@@ -1,0 +1,235 @@
+"""A rig of several LiDARs: its file, the command, the result that is written, and exports."""
+
+import io
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from rich.console import Console
+
+import calibgraph
+from calibgraph.errors import DatasetError, FileError, RigError
+from calibgraph.io.formats.export import export_calibration
+from calibgraph.io.rigs import load_rig
+from calibgraph.model.calibration import Calibration
+from calibgraph.model.geometry import transform
+from calibgraph.report.html import render_page
+from calibgraph.report.tables import print_result
+from tests.conftest import SAMPLE, Call
+from tests.vehicle.scenes import MOUNTS, record
+
+RIG = {"format": "calibgraph-rig/1", "lidar": "top", "lidars": {name: {} for name in MOUNTS}}
+
+
+SAMPLE_RIG = (SAMPLE / "rig.yaml").read_text()
+
+
+def write_vehicle(folder: Path, seed: int = 1, places: int = 3, **more: object) -> Path:
+    for name, clouds in record(seed, places=places).items():
+        (folder / "lidars" / name).mkdir(parents=True)
+        for number, cloud in enumerate(clouds):
+            of = np.column_stack([cloud, np.ones(len(cloud))]).astype(np.float32)
+            np.save(folder / "lidars" / name / f"{number:06d}.npy", of)
+    (folder / "rig.yaml").write_text(yaml.safe_dump({**RIG, **more}))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def vehicle(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    known = {
+        "T_vehicle_lidar": transform(np.eye(3), [1.0, 0.0, 1.7]).tolist(),
+        "rotation_sigma_rad": 0.02, "translation_sigma_m": [0.01, 0.01, 0.3],
+    }  # fmt: skip
+    return write_vehicle(tmp_path_factory.mktemp("vehicle"), vehicle=known)
+
+
+@pytest.fixture(scope="module")
+def result(vehicle: Path) -> Calibration:
+    return calibgraph.calibrate(vehicle)
+
+
+def test_every_lidar_has_a_pose_a_sigma_and_a_verdict(result: Calibration):
+    for name in ("front", "left"):
+        off = result.T_base_lidar[name][:3, 3] - MOUNTS[name][:3, 3]
+        degrees, centimetres = result.sigmas(name)
+        assert np.abs(off).max() < 0.004 and centimetres.max() < 1.5 and degrees.max() < 0.1
+    assert {name: of.status for name, of in result.verdicts.items()} == {
+        "front": "PASS", "left": "PASS"
+    }  # fmt: skip
+    assert result.verdict.status == "PASS"
+    assert result.joint_names == ("front", "left")
+    assert result.joint_covariance.shape == (12, 12)
+    assert np.isclose(result.T_vehicle_lidar[2, 3], 1.8, atol=0.02), "over the road, not as typed"
+    assert np.isfinite(result.vehicle_sigmas).all()
+
+
+def test_a_result_is_read_as_it_was_written(result: Calibration, tmp_path: Path):
+    path = result.save(tmp_path / "out")
+    again = calibgraph.load_calibration(path)
+    assert again.verdicts == result.verdicts
+    np.testing.assert_allclose(again.joint_covariance, result.joint_covariance)
+    for name, T in result.T_base_lidar.items():
+        np.testing.assert_array_equal(again.T_base_lidar[name], T)
+        np.testing.assert_array_equal(load_rig(path).T_base_lidar[name], T)
+    np.testing.assert_array_equal(again.vehicle_sigmas, result.vehicle_sigmas)
+    content = yaml.safe_load(path.read_text())
+    content["lidar_verdicts"]["left"]["status"] = "WARN"
+    path.write_text(yaml.safe_dump(content))
+    with pytest.raises(FileError, match="verdict WARN of LiDAR 'left', its checks give PASS"):
+        calibgraph.load_calibration(path)
+
+
+def test_the_report_has_a_table_of_lidars(result: Calibration):
+    page = render_page(result)
+    assert "Can this calibration of 2 LiDARs to the LiDAR top be used?" in page
+    assert (
+        "T_base_lidar of left" in page
+        and "top in base_link" in page
+        and "All LiDARs" in page
+        and "All cameras" not in page
+    )
+
+
+def test_the_command_writes_and_prints_all_lidars(tmp_path: Path, call: Call):
+    folder = write_vehicle(tmp_path / "data", seed=2, places=1)
+    code, out, err = call("calibrate", folder, "--out", tmp_path / "out", "--json")
+    assert code == 0, err
+    printed = json.loads(out)
+    assert printed["cameras"] == {} and [*printed["lidars"]] == ["front", "left"]
+    assert printed["verdict"] == "WARN" and printed["cannot_tell"], "one instant is too few"
+    print_result(
+        Console(file=(text := io.StringIO()), width=80),
+        calibgraph.load_calibration(tmp_path / "out"),
+        [],
+        1.0,
+    )
+    assert "LiDARs in top" in text.getvalue()
+    assert "cannot tell: instants: 1, below the limit 3" in text.getvalue()
+
+
+def test_transforms_of_lidars_and_vehicle_are_exported(result: Calibration, tmp_path: Path):
+    kit = tmp_path / "sensor_kit_calibration.yaml"
+    written = export_calibration(result, kit, "autoware")
+    assert [path.name for path in written] == [kit.name, "sensors_calibration.yaml"]
+    links = yaml.safe_load(kit.read_text())["sensor_kit_base_link"]
+    assert [*links] == ["top", "front", "left"]
+    assert np.allclose([links["left"][k] for k in "xyz"], result.T_base_lidar["left"][:3, 3])
+    kit_in_vehicle = yaml.safe_load(written[1].read_text())["base_link"]["sensor_kit_base_link"]
+    assert np.allclose([kit_in_vehicle[k] for k in "xyz"], result.T_vehicle_lidar[:3, 3])
+    urdf = export_calibration(result, tmp_path / "rig.urdf", "urdf")[0].read_text()
+    assert '<parent link="top" />' in urdf and '<child link="left" />' in urdf
+    assert '<parent link="base_link" />' in urdf
+    launch = export_calibration(result, tmp_path / "rig.launch.xml", "ros2-launch")[0].read_text()
+    assert launch.count("<node") == 3
+    assert json.loads(export_calibration(result, tmp_path / "r.json", "json")[0].read_text())[
+        "lidars"
+    ]
+    with pytest.raises(RigError, match="no camera, only LiDARs"):
+        export_calibration(result, tmp_path / "calib.txt", "kitti")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"lidars": None}, "cameras: the rig has none; name one, or at least two lidars"),
+        ({"lidars": {"top": {}}}, "name one, or at least two lidars"),
+        ({"lidar": "roof"}, "the base 'roof' is none of the lidars front, left, top"),
+        ({"lidars": {**RIG["lidars"], "top": {"T_base_lidar": MOUNTS["left"].tolist()}}},
+         "lidars.top.T_base_lidar: of the base it is the identity"),
+        ({"lidars": {"top": {}, "left": {"T_lidar_base": 1}}}, "unknown key 'lidars.left.T_lidar"),
+        (
+            {"lidars": None, "vehicle": {}, "cameras": yaml.safe_load(SAMPLE_RIG)["cameras"],
+             "lidar": "lidar"},
+            "vehicle: is found with several lidars",
+        ),
+        ({"vehicle": {"rotation_sigma_rad": [1, 2]}}, "vehicle.rotation_sigma_rad"),
+        ({"vehicle": {"translation_sigma_m": -1}}, "vehicle.translation_sigma_m"),
+    ],
+)  # fmt: skip
+def test_a_wrong_rig_is_refused_in_one_line(change: dict, message: str, tmp_path: Path):
+    path = tmp_path / "rig.yaml"
+    path.write_text(yaml.safe_dump({**RIG, **change}))
+    with pytest.raises(FileError, match=message) as caught:
+        load_rig(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_instants_without_all_clouds_are_left_out_and_named(vehicle: Path, tmp_path: Path):
+    folder = write_vehicle(tmp_path, places=1)
+    (folder / "lidars" / "left" / "000000.npy").rename(folder / "lidars" / "left" / "1.npy")
+    with pytest.raises(DatasetError, match="of 1 of top, front has 1, left has 0; clouds of one"):
+        calibgraph.calibrate(folder)
+    with pytest.raises(FileError, match=r"lidars.right: no such folder"):
+        calibgraph.calibrate(vehicle, load_rig(vehicle).model_copy(update={
+            "lidars": {**load_rig(vehicle).lidars, "right": load_rig(vehicle).lidars["left"]}
+        }))  # fmt: skip
+
+
+@pytest.mark.parametrize("command", ["match", "check", "evaluate"])
+def test_commands_for_cameras_refuse_a_rig_of_lidars_alone(
+    command: str, vehicle: Path, result: Calibration, tmp_path: Path, call: Call
+):
+    other = replace(result, inputs={"another": "0" * 64})
+    saved = [of.save(tmp_path / str(n)).parent for n, of in enumerate((result, other))]
+    words = {
+        "match": [vehicle, "--out", tmp_path / "m.parquet"], "check": [saved[0], vehicle],
+        "evaluate": saved,
+    }  # fmt: skip
+    code, out, err = call(command, *words[command])
+    assert (code, out) == (2, "") and "no camera, only LiDARs (front, left, top)" in err
+
+
+def test_a_bag_has_a_topic_of_clouds_per_lidar(tmp_path: Path):
+    writing = pytest.importorskip("tests.io.bags.writing")
+    make, clouds, messages = writing.Messages("mcap"), record(3, places=2), []
+    for name, of in clouds.items():
+        for number, cloud in enumerate(of):
+            late_ns = {"top": 0, "front": 4_000_000, "left": -7_000_000}[name]
+            stamp_ns = writing.START_NS + number * writing.PERIOD_NS + late_ns
+            points = writing.structured(np.column_stack([cloud, np.ones(len(cloud))]))
+            topic = f"/sensing/{name}/points"
+            content = make.cloud(points, stamp_ns)
+            kind = "sensor_msgs/msg/PointCloud2"
+            messages.append(writing.Stamped(topic, kind, stamp_ns, content))
+    bag = writing.write_bag(tmp_path, "mcap", sorted(messages, key=lambda each: each.record_ns))
+    (tmp_path / "rig.yaml").write_text(yaml.safe_dump(RIG))
+    rig = load_rig(tmp_path / "rig.yaml")
+    data = calibgraph.load_dataset(bag, rig)
+    assert "2 clouds, 2 with all clouds of other LiDARs within 0.05 s" in " ".join(data.notes)
+    for number, frame in enumerate(data.frames):
+        for name, of in clouds.items():
+            found = frame.load_cloud() if name == "top" else frame.load_lidar(name)
+            np.testing.assert_array_equal(found[:, :3], of[number].astype(np.float32))
+    with pytest.raises(DatasetError, match=r"LiDAR 'roof'\? .*--topic roof=/TOPIC"):
+        lidars = {"top": rig.lidars["top"], "roof": rig.lidars["left"]}
+        calibgraph.load_dataset(bag, rig.model_copy(update={"lidars": lidars}))
+    with pytest.raises(DatasetError, match="several LiDARs are not corrected for motion"):
+        calibgraph.load_dataset(bag, rig, bag=calibgraph.BagOptions(motion="scans"))
+
+
+@pytest.mark.slow
+def test_cameras_and_lidars_are_one_result(tmp_path: Path):
+    T, rng = MOUNTS["left"], np.random.default_rng(0)
+    for frame in calibgraph.load_dataset(SAMPLE).frames:
+        cloud = frame.load_cloud()
+        other = cloud[rng.random(len(cloud)) < 0.7].copy()
+        other[:, :3] = (other[:, :3] - T[:3, 3]) @ T[:3, :3] + rng.normal(0, 0.01, (len(other), 3))
+        for name, points in (("lidar", cloud), ("second", other)):
+            (tmp_path / "lidars" / name).mkdir(parents=True, exist_ok=True)
+            np.save(tmp_path / "lidars" / name / frame.cloud_path.stem, points)
+    shutil.copytree(SAMPLE / "cameras", tmp_path / "cameras")
+    rig = {**yaml.safe_load(SAMPLE_RIG), "lidars": {"lidar": {}, "second": {}}}
+    (tmp_path / "rig.yaml").write_text(yaml.safe_dump(rig))
+    both, alone = calibgraph.calibrate(tmp_path), calibgraph.calibrate(SAMPLE)
+    assert both.joint_names == (*alone.rig.cameras, "second")
+    cameras = 6 * len(alone.rig.cameras)
+    np.testing.assert_array_equal(
+        both.joint_covariance[:cameras, :cameras], alone.joint_covariance
+    )  # cameras are calibrated to the base as without the other LiDAR
+    for name, pose in alone.T_camera_lidar.items():
+        np.testing.assert_array_equal(both.T_camera_lidar[name], pose)
+    assert np.abs(both.T_base_lidar["second"] - T).max() < 0.005
