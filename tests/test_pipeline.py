@@ -22,7 +22,7 @@ from calibgraph import (
     perturb,
     simulate_correspondences,
 )
-from calibgraph.graph.variables import MOST_CAMERAS, aligned_key, camera_key
+from calibgraph.graph.variables import MOST_CAMERAS, body_key, camera_key
 from calibgraph.model.config import preset
 from calibgraph.model.geometry import invert, twist_between
 from calibgraph.model.places import Places
@@ -204,7 +204,7 @@ def test_the_result_is_the_optimum_of_its_graph(truth: Rig, guess: Rig, config: 
     result = calibgraph.solve(guess.moved_to(truth.T_camera_lidar), table, config)
     values = minimize(result.graph, values_of(result))
     covariance = result.joint_covariance
-    of = aligned_key if config.preset == "auto" else camera_key
+    of = body_key if config.preset == "auto" else camera_key
     keys = [of(number) for number in range(len(truth.cameras))]
     for number, (name, T) in enumerate(result.T_camera_lidar.items()):
         found = invert(values.atPose3(keys[number]).matrix())

@@ -26,7 +26,7 @@ from calibgraph.model.rig import Camera, Rig
 from calibgraph.solver.covariance import FittedObjective, positive_part
 from calibgraph.solver.places import ErrorFit
 from calibgraph.solver.within_place import WEAK, WithinPlace
-from factors import ProjectionBlock, to_runs, unproject
+from factors import ProjectionBlock, to_runs
 from factors.columns import CENTRE_X, CENTRE_Y, FOCAL, OFFSET, READOUT
 
 Lenses = Mapping[str, LensVariable]
@@ -42,7 +42,7 @@ _WEAK_PRIOR = 0.01  # information: a lens that is ten sigmas off is hardly held 
 _MOST_STEPS, _MINIMAL = 20, 1e-4  # of Gauss-Newton; decrease of the cost by the last
 _SCENES = 0.7, 1.4  # times as far are the things of another recording: so streets scatter
 _DEPTHS = 0.5, 1.0, 2.0  # of a scene, over its mean
-_GRID = 9, 6  # columns and rows of things in an image
+_DIRECTIONS_SEEN = 64  # at most, of those of the matches
 _NEAREST_M = 0.1
 _DIRECTIONS = "pitch", "yaw", "roll", "x", "y", "z"
 _UNITS = {FOCAL: "px", CENTRE_X: "px", CENTRE_Y: "px", OFFSET: "s", READOUT: "s"}
@@ -177,18 +177,18 @@ def error_by_lens(  # noqa: PLR0913 - of what, where
 def _in_other_scenes(
     lens: LensVariable, block: ProjectionBlock, T_camera_lidar: Array, rows: list[int]
 ) -> Array:
-    """(2, 6, m) by how much a pose makes up for a lens where things fill the image, for a clock 0.
+    """(2, 6, m) by how much a pose makes up for a lens in other scenes, for a clock by nothing.
 
-    At distances around those of the matches, once all nearer and once all farther.
+    In each of these there are things in all directions of the matches at all of some distances:
+    around theirs, once all nearer and once all farther.
     """
     camera = lens.camera
     points = block.points_lidar_m @ T_camera_lidar[:3, :3].T + T_camera_lidar[:3, 3]
-    usual_m = np.exp(np.log(np.linalg.norm(points, axis=1) + _NEAREST_M).mean())
-    x, y = ((np.arange(n) + 0.5) / n for n in _GRID)
-    size = camera.width_px, camera.height_px
-    pixels = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2) * size - 0.5
-    rays, known = unproject(camera.lens, pixels)
-    rays, pixels = rays[known] / np.linalg.norm(rays[known], axis=1)[:, None], pixels[known]
+    distances = np.linalg.norm(points, axis=1) + _NEAREST_M
+    usual_m = np.exp(np.log(distances).mean())
+    step = -(-len(points) // _DIRECTIONS_SEEN)
+    rays = points[::step] / distances[::step, None]
+    pixels, _ = camera.lens.project(rays)
     at_m = usual_m * np.outer(_SCENES, _DEPTHS).ravel()
     points, pixels = (at_m[:, None, None] * rays).reshape(-1, 3), np.tile(pixels, (len(at_m), 1))
     scenes, count = ProjectionBlock(camera.lens, points, pixels, loss="l2"), len(_SCENES)
