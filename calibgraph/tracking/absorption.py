@@ -295,7 +295,9 @@ def consider_lens(state: State, camera: int, matches: CameraBlock) -> Array:
     columns = lens_columns(lens, block, T)
     if before.shape == columns.shape:  # else motion became known, or none yet
         columns = columns + before
-    found = error_by_lens(lens, columns, block, T, of=state.config.of)
+    kept = state.matches_of(camera)  # in more directions than those of one epoch
+    seen = block if kept is None else kept[0].with_scale(state.scales[camera]).select(kept[1])
+    found = error_by_lens(lens, columns, seen, T, of=state.config.of)
     state.put(camera, lens_errors=np.zeros((6, 6)) if found is None else found)
     return columns
 
