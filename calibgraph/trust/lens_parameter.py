@@ -145,18 +145,25 @@ class LensParameter:
         return (z_score * limit("lens_wrong") / total) ** 2 / 2 + math.log(self.sigma / total)
 
     def probability(
-        self, tolerance: tuple[float, float] = TOLERANCE, others: Sequence[LensParameter] = ()
+        self,
+        tolerance: tuple[float, float] = TOLERANCE,
+        others: Sequence[LensParameter] = (),
+        *,
+        unseen: bool = False,
     ) -> float:
         """That the parameter is wrong and displaces the camera beyond a tolerance [deg, cm].
 
         What the estimate adds to it: Bayes' rule, of two kinds of lens parameters, usual ones and
         wrong ones. Their errors are normally distributed with mean zero; wrong ones are rare. What
         usual ones do to the pose is in its error bar. Where one of several was wrong, the others
-        look wrong, too, if each is set free alone; it is the one that explains most. An aspect
-        ratio that no lens has counts even if the camera moves little when it is set free: matches
-        from rounds have followed it. At the default tolerance any size of it counts. At a wider one
-        it counts if half of it, as an angle, exceeds what the tolerance adds to the default
-        rotation.
+        look wrong, too, if each is set free alone; it is the one that explains most. With
+        ``unseen``, what was probable before counts, too: that a lens is wrong that these data do
+        not show, as in front of a wall.
+
+        An aspect ratio that no lens has counts even if the camera moves little when it is set free:
+        matches from rounds have followed it. At the default tolerance any size of it counts. At a
+        wider one it counts if half of it, as an angle, exceeds what the tolerance adds to the
+        default rotation.
         """
         if not math.isfinite(self.sigma):  # not determined
             return 0.0
@@ -171,6 +178,8 @@ class LensParameter:
         gain = wrong / math.hypot(self.sigma, wrong)
         after = _share_beyond(counted, gain**2 * self.size, gain * self.sigma)
         before = _share_beyond(counted, 0.0, wrong)
+        if unseen:
+            return float(expit(odds)) * after
         return max(float(expit(odds) * is_this) * after - share * before, 0.0)
 
     def _log_density(self, spread: float) -> float:
@@ -235,13 +244,17 @@ def check_parameter(
     options: str = "",
     *,
     others: Sequence[LensParameter] = (),
+    unseen: bool = False,
 ) -> Check:
     """Whether a lens parameter is wrong, by RESIDUALS or IMAGES: the value is the probability.
 
     For a tolerance [deg, cm]; ``options`` are those that its estimate needs, " --interval-s 0.1";
-    ``others`` of its lens have been set free alone, too.
+    ``others`` of its lens have been set free alone, too. ``unseen``: whether what the data do not
+    show counts.
     """
     row, probability = threshold("lens"), found.probability(tolerance, others)
+    if unseen:  # it blames no lens
+        probability = max(probability, min(found.probability(tolerance, unseen=True), row.warn))
     deg, cm = found.moved
     status, (part, *_) = row.grade(probability), _WORDS[found.name]
     text = f"by the {by}, {found.describe()}; the camera would move by {deg:.2g} deg, {cm:.2g} cm"
