@@ -119,7 +119,7 @@ def test_json_is_on_stdout_and_complete(problem: Path, call: Call) -> None:
     assert stderr == ""
     summary = json.loads(stdout)
     keys = {"verdict", "probability_off", "reasons", "cameras", "pairs", "timings_s", "files"}
-    assert set(summary) == {*keys, "cannot_tell", "summary", "warnings", "places"}
+    assert set(summary) == {*keys, "cannot_tell", "summary", "warnings", "places", "lidars"}
     assert summary["verdict"] == "PASS"
     assert summary["cannot_tell"] is False
     each = [camera["probability_off"] for camera in summary["cameras"].values()]
