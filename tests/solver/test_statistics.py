@@ -40,6 +40,7 @@ def test_the_covariance_is_the_scatter_over_draws(pair: Rig, frames: int) -> Non
     """
     errors = MatcherErrors(noise_px=1.0, frame_noise_px=1.0, outlier_share=0.15)
     squares: dict[str, list[float]] = {"left": [], "right": [], "left->right": []}
+    pair = with_known_lenses(pair)
     for seed in range(DRAWS):
         table = simulate_correspondences(pair, frames=frames, matches=100, errors=errors, seed=seed)
         solved = solve_joint(pair, table)  # without the checks, which take most of a solve's time

@@ -10,6 +10,7 @@ import numpy as np
 from calibgraph import Camera, IncrementalCalibrator, Intrinsics, MatcherErrors, Rig, perturb
 from calibgraph.tracking.history import History
 from tests.draws.drives import simulate_drive
+from tests.draws.lenses import with_known_lenses
 
 FORWARD = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 ERRORS = MatcherErrors(noise_px=1.0, frame_noise_px=0.5, outlier_share=0.1)
@@ -26,13 +27,15 @@ def camera(position_m: tuple[float, float, float], yaw_deg: float) -> Camera:
     return Camera(width_px=1240, height_px=376, intrinsics_px=intrinsics, T_camera_lidar=T)
 
 
-RIG = Rig(
-    cameras={
-        "left": camera((0.3, 0.1, -0.1), 0),
-        "right": camera((0.3, -0.4, -0.1), 0),
-        "side": camera((0.0, 0.4, -0.1), 80),
-    }
-)
+RIG = with_known_lenses(
+    Rig(
+        cameras={
+            "left": camera((0.3, 0.1, -0.1), 0),
+            "right": camera((0.3, -0.4, -0.1), 0),
+            "side": camera((0.0, 0.4, -0.1), 80),
+        }
+    )
+)  # as the draws have them
 NAMES = list(RIG.cameras)
 
 
