@@ -150,8 +150,9 @@ Datasets = Annotated[
     list[Path],
     Argument(
         metavar="DATASET...",
-        help="Dataset folder (rig.yaml, lidar/, cameras/NAME/), KITTI odometry sequence or raw "
-        "drive, nuScenes folder or scene, or ROS bag; several of one rig are calibrated together.",
+        help="Dataset folder (rig.yaml, lidar/ or lidars/NAME/, cameras/NAME/), KITTI odometry "
+        "sequence or raw drive, nuScenes folder or scene, or ROS bag; several of one rig are "
+        "calibrated together.",
     ),
 ]
 RigFile = Annotated[
@@ -174,7 +175,8 @@ Topic = Annotated[
     Option(
         metavar="NAME=/TOPIC[,/INFO]",
         rich_help_panel=_BAGS,
-        help="Topic of a camera's images, of the clouds as lidar=/TOPIC, or of odometry=/TOPIC; "
+        help="Topic of a camera's images, of clouds as lidar=/TOPIC (of several LiDARs "
+        "with their names), or of odometry=/TOPIC; "
         "INFO: of the camera_info. May be repeated. (default: found by types)",
     ),
 ]

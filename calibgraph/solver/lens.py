@@ -43,7 +43,7 @@ _MOST_STEPS, _MINIMAL = 20, 1e-4  # of Gauss-Newton; decrease of the cost by the
 _SCENES = 0.7, 1.4  # times as far are the things of another recording: so streets scatter
 _DEPTHS = 0.5, 1.0, 2.0  # of a scene, over its mean
 _DIRECTIONS_SEEN = 500  # at most, of those of the matches
-_NEAREST_M = 0.1
+_NEAREST_M = 0.1  # added to distances, whose logarithms are taken
 _DIRECTIONS = "pitch", "yaw", "roll", "x", "y", "z"
 _UNITS = {FOCAL: "px", CENTRE_X: "px", CENTRE_Y: "px", OFFSET: "s", READOUT: "s"}
 

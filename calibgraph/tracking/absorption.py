@@ -289,9 +289,11 @@ def _start_camera(state: State, camera: int, T_camera_lidar: Array) -> None:
 def consider_lens(state: State, camera: int, matches: CameraBlock) -> Array:
     """What may err of a camera's lens, by some matches and closed epochs; (6, 6 + k) of both."""
     of, T = state.rig.cameras[state.names[camera]], state.references[camera]
-    inliers = matches.within_gate(T, state.scales[camera].gate_px)
-    block = matches.select(inliers if inliers.any() else ~inliers).with_scale(state.scales[camera])
-    lens, before = considered_lens(of, block), state.lens[camera]
+    before, inliers = state.lens[camera], matches.within_gate(T, state.scales[camera].gate_px)
+    if not inliers.any():
+        return before
+    block = matches.select(inliers).with_scale(state.scales[camera])
+    lens = considered_lens(of, block)
     columns = lens_columns(lens, block, T)
     if before.shape == columns.shape:  # else motion became known, or none yet
         columns = columns + before

@@ -145,28 +145,33 @@ class LensParameter:
         return (z_score * limit("lens_wrong") / total) ** 2 / 2 + math.log(self.sigma / total)
 
     def probability(
-        self,
-        tolerance: tuple[float, float] = TOLERANCE,
-        others: Sequence[LensParameter] = (),
-        *,
-        unseen: bool = False,
+        self, tolerance: tuple[float, float] = TOLERANCE, others: Sequence[LensParameter] = ()
     ) -> float:
         """That the parameter is wrong and displaces the camera beyond a tolerance [deg, cm].
 
         What the estimate adds to it: Bayes' rule, of two kinds of lens parameters, usual ones and
         wrong ones. Their errors are normally distributed with mean zero; wrong ones are rare. What
         usual ones do to the pose is in its error bar. Where one of several was wrong, the others
-        look wrong, too, if each is set free alone; it is the one that explains most. With
-        ``unseen``, what was probable before counts, too: that a lens is wrong that these data do
-        not show, as in front of a wall.
+        look wrong, too, if each is set free alone; it is the one that explains most.
 
         An aspect ratio that no lens has counts even if the camera moves little when it is set free:
         matches from rounds have followed it. At the default tolerance any size of it counts. At a
         wider one it counts if half of it, as an angle, exceeds what the tolerance adds to the
         default rotation.
         """
+        is_wrong, after, before = self._shares_wrong(tolerance)
+        is_this = softmax([self.evidence, *(other.evidence for other in others)])[0]
+        return max(float(is_wrong * is_this) * after - before, 0.0)
+
+    def probability_with_prior(self, tolerance: tuple[float, float] = TOLERANCE) -> float:
+        """The same with what was probable before: that these data do not show a wrong lens."""
+        is_wrong, after, _ = self._shares_wrong(tolerance)
+        return is_wrong * after
+
+    def _shares_wrong(self, tolerance: tuple[float, float]) -> tuple[float, float, float]:
+        """That it is wrong; if so, that it moves the camera too far; both before the estimate."""
         if not math.isfinite(self.sigma):  # not determined
-            return 0.0
+            return 0.0, 0.0, 0.0
         moves = max(moved / most for moved, most in zip(self.moved, tolerance, strict=True))
         counted = self.size / moves if moves else math.inf
         if self.name == ASPECT_RATIO:
@@ -174,13 +179,9 @@ class LensParameter:
             counted = math.radians(TOLERANCE[0]) * max(wider, 0.0) / (self.units[0] / 2)
         wrong, share = limit("lens_wrong"), limit("lens_wrong_share")
         odds = logit(share) + self._log_density(wrong) - self._log_density(1.0)
-        is_this = softmax([self.evidence, *(other.evidence for other in others)])[0]
         gain = wrong / math.hypot(self.sigma, wrong)
         after = _share_beyond(counted, gain**2 * self.size, gain * self.sigma)
-        before = _share_beyond(counted, 0.0, wrong)
-        if unseen:
-            return float(expit(odds)) * after
-        return max(float(expit(odds) * is_this) * after - share * before, 0.0)
+        return float(expit(odds)), after, share * _share_beyond(counted, 0.0, wrong)
 
     def _log_density(self, spread: float) -> float:
         """The log density of the values among parameters that spread so."""
@@ -254,7 +255,7 @@ def check_parameter(
     """
     row, probability = threshold("lens"), found.probability(tolerance, others)
     if unseen:  # it blames no lens
-        probability = max(probability, min(found.probability(tolerance, unseen=True), row.warn))
+        probability = max(probability, min(found.probability_with_prior(tolerance), row.warn))
     deg, cm = found.moved
     status, (part, *_) = row.grade(probability), _WORDS[found.name]
     text = f"by the {by}, {found.describe()}; the camera would move by {deg:.2g} deg, {cm:.2g} cm"
