@@ -57,6 +57,11 @@ class PairTerm:
     block: PairBlock
     frame: NDArray[np.int64]
 
+    @property
+    def pair(self) -> frozenset[str]:
+        """Its cameras."""
+        return frozenset((self.a, self.b))
+
     @cached_property
     def frame_edges(self) -> NDArray[np.int64]:
         """(f + 1,) where the frames begin, and the end."""
