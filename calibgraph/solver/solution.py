@@ -179,7 +179,7 @@ class Solution:
             return ()
         frame = self.correspondences.places.merge_stationary(self.camera_matches.frame)
         rig, matches = self.rig.moved_to(self.T_camera_lidar), self.camera_matches
-        return pair_terms(rig, replace(matches, frame=frame), self.config)
+        return pair_terms(rig, replace(matches, frame=frame))
 
     @cached_property
     def pairs_alone(self) -> Places:

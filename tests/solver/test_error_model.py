@@ -253,7 +253,7 @@ def test_its_size_is_found_from_what_cameras_see_in_common(mixed_rig: Rig, size:
 def fits_of(rig: Rig) -> list[PairFit]:
     """Where exact images place the cameras."""
     held = np.array([np.diag(EACH)] * len(rig.cameras))
-    terms = pair_terms(rig, simulated_pairs(rig), Config())
+    terms = pair_terms(rig, simulated_pairs(rig))
     T = rig.T_camera_lidar
     return fit_pairs(terms, T, held, place_pairs(terms, T))
 

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 import calibgraph
 from calibgraph import (
     Calibration,
-    Config,
     Correspondences,
     MatcherErrors,
     Rig,
@@ -121,7 +120,7 @@ SIGMAS = pose_sigmas(rotation_rad=np.radians(0.05), translation_m=0.01)
 
 
 def agreement(rig: Rig, table: CameraMatches) -> PairAgreement:
-    terms, held = pair_terms(rig, table, Config()), np.array([np.diag(SIGMAS**2)] * 2)
+    terms, held = pair_terms(rig, table), np.array([np.diag(SIGMAS**2)] * 2)
     T = rig.T_camera_lidar
     (fit,) = fit_pairs(terms, T, held, place_pairs(terms, T))
     return pair_agreement(rig, fit, np.diag(np.tile(SIGMAS**2, 2)))
