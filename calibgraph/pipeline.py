@@ -222,7 +222,6 @@ def to_calibration(evidence: Evidence, checks: RunChecks) -> Calibration:
         error_sources=Later(lambda: evidence.error_sources),
         lens=solution.lens,
         lens_covariance=_with_poses(solution.lens_covariance, evidence),
-        bootstrap=evidence.bootstrap,
         places=solution.correspondences.places.of_frames(solution.correspondences.frame),
         correspondences=solution.correspondences,
         camera_matches=solution.camera_matches,

@@ -166,17 +166,6 @@ def residuals_of(solution: Solution) -> dict[str, Residuals]:
     return {n: BlockResiduals.at(poses[n], block).summary(scales[n]) for n, block in blocks}
 
 
-def bootstrap_checks(evidence: Evidence) -> Checks:
-    """Whether the reported covariance is as large as the bootstrap's, if there is one."""
-    row, checks = threshold("bootstrap_sigma"), {}
-    for name, bootstrap in evidence.bootstrap.items():
-        reported = evidence.covariance_by_matches(name)
-        if reported is not None:
-            ratio = float(np.sqrt(np.max(np.diag(bootstrap) / np.diag(reported))))
-            checks[name] = [row.check(ratio)]
-    return checks
-
-
 def prior_share_checks(evidence: Evidence) -> Checks:
     """How much of a result comes from priors and relative poses."""
     row = threshold("prior_share")

@@ -155,8 +155,7 @@ def test_a_solve_of_a_file_is_that_of_the_table_to_the_last_bit(pair: Rig, tmp_p
     errors = MatcherErrors(noise_px=1.0, frame_noise_px=0.3, outlier_share=0.2)
     table = simulate_correspondences(pair, frames=6, matches=300, errors=errors)
     path = saved(table, tmp_path / "table.parquet")
-    config = Config(bootstrap=5)
-    one, other = (calibgraph.solve(pair, given, config) for given in (path, table))
+    one, other = (calibgraph.solve(pair, given) for given in (path, table))
     for name in pair.cameras:
         np.testing.assert_array_equal(one.T_camera_lidar[name], other.T_camera_lidar[name])
         np.testing.assert_array_equal(one.covariance[name], other.covariance[name])
