@@ -165,7 +165,7 @@ def track(
     with _stopped_by_signals() as stop:
         if waits:
             warm_up_tracker()
-        items, calibrator, result_of = _opened(settings, source, stop, notify)
+        items, calibrator = _opened(settings, source, notify)
         gc.freeze()  # what is loaded by now stays: each full collection would visit it, for 0.1 s
         run = Run(calibrator, notify)
         with calibrator:
@@ -173,7 +173,7 @@ def track(
             if calibrator.tracker.frame is None and not stop():
                 held = f"held no frame that could be used ({run.left_out} left out); check it"
                 raise FileError("standard input" if waits else source[0], held)
-            result = _result(calibrator.tracker, result_of, settings.out / STATE_FOLDER)
+            result = _result(calibrator.tracker, settings.out / STATE_FOLDER)
     run.report_counts()
     # The guess, not where the first batch has located it.
     verdicts = {name: _at_the_end(one) for name, one in result.camera_verdicts.items()}
@@ -196,11 +196,9 @@ def _at_the_end(verdict: Verdict) -> Verdict:
     )
 
 
-def _result(
-    tracker: IncrementalCalibrator, of: Callable[[IncrementalCalibrator], Calibration], state: Path
-) -> Calibration:
+def _result(tracker: IncrementalCalibrator, state: Path) -> Calibration:
     try:
-        return of(tracker)
+        return tracker.calibration(sources=True)
     except UNSOLVABLE as error:
         why = str(error).strip().partition("\n")[0]
         raise CalibrationError(
@@ -210,11 +208,9 @@ def _result(
 
 
 def _opened(
-    settings: Tracking, source: Sequence[Path], stop: Stop, notify: Notify
-) -> tuple[Iterator[Item], DurableCalibrator, Callable[[IncrementalCalibrator], Calibration]]:
-    """The frames of the source, the durable tracker, and the function that gives its result."""
-    result_of: Callable[[IncrementalCalibrator], Calibration]
-    result_of = partial(IncrementalCalibrator.calibration, sources=True)
+    settings: Tracking, source: Sequence[Path], notify: Notify
+) -> tuple[Iterator[Item], DurableCalibrator]:
+    """The frames of the source, and the durable tracker."""
     folder = settings.out / STATE_FOLDER
     if settings.matcher is None:
         items = frames_of(str(source[0]))
@@ -224,10 +220,9 @@ def _opened(
         begin = partial(_first_rig, drive, settings.rig, notify)
         calibrator = DurableCalibrator(folder, settings.rig, drive.config, begin=begin)
         items = drive.items(calibrator.tracker)
-        result_of = partial(drive.result, stop=stop, notify=notify)
     if calibrator.resumed:
         notify(f"going on after frame {calibrator.tracker.frame}")
-    return items, calibrator, result_of
+    return items, calibrator
 
 
 def _drive(settings: Tracking, matcher: Matcher, source: Sequence[Path]) -> DatasetDrive:

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 
-import cv2
-import numpy as np
-
-from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError, CorrespondenceError, MotionError
 from calibgraph.io.dataset import Dataset
 from calibgraph.io.frame import Frame
@@ -28,10 +24,6 @@ from calibgraph.tracking.frame_order import StreamFrame
 from calibgraph.tracking.streams import Item, frames_of_table
 from calibgraph.tracking.sums import MOST_PLACES
 from calibgraph.tracking.tracker import IncrementalCalibrator
-from calibgraph.trust.pose_posterior import PosePosterior, measure_posteriors
-
-_UNSCORED = (CalibrationError, OSError, np.linalg.LinAlgError, cv2.error, RuntimeError)
-"""What reading and scoring images raises: a result after a long drive is not lost by it."""
 
 MOST_AGAIN = 200
 """Frames that a restart looks at again, at 0.1 s each, to find where the vehicle is."""
@@ -98,39 +90,6 @@ class DatasetDrive:
         seed = self.config.seed
         finder = PlaceFinder(tracker.initial_rig, most_places=MOST_PLACES, seed=seed)
         return with_places(self._frames(tracker), self.dataset, finder, tracker.places)
-
-    def result(
-        self, tracker: IncrementalCalibrator, *, stop: Stop, notify: Callable[[str], None]
-    ) -> Calibration:
-        """The estimate, with its error bar and verdict by the images of its last frames, too.
-
-        Args:
-            tracker: at the end of the drive.
-            stop: whether the result is wanted at once, without the images; it interrupts them.
-            notify: called with a sentence if they are left out, or cannot be scored.
-        """
-        if self.matcher.image_checks_can_fail:  # others may use what the scores do not
-            try:
-                with stop.interruptible():
-                    return tracker.calibration(partial(self._measure, tracker.rig), sources=True)
-            except KeyboardInterrupt:
-                notify("stopped: the images were not compared with the clouds")
-            except _UNSCORED as error:
-                notify(f"warning: the images could not be checked: {error}")
-        return tracker.calibration(sources=True)
-
-    def _measure(
-        self,
-        rig: Rig,
-        numbers: Sequence[int],
-        covariances: Mapping[str, Array],
-        groups: Sequence[Sequence[str]],
-    ) -> Mapping[str, PosePosterior]:
-        frames = tuple(frame for frame in self.dataset.frames if frame.index in {*numbers})
-        if not frames:
-            return {}
-        data = replace(self.dataset, frames=frames)
-        return measure_posteriors(data, rig, covariances, groups, seed=self.config.seed)
 
     def _frames(self, tracker: IncrementalCalibrator) -> Iterator[Item]:
         head, taken = self._head, tracker.frame

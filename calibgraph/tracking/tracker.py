@@ -35,7 +35,6 @@ from calibgraph.tracking.absorption import (
     start_cameras,
 )
 from calibgraph.tracking.assessment import (
-    MeasureOnFrames,
     Update,
     make_updates,
     to_calibration,
@@ -118,13 +117,11 @@ class IncrementalCalibrator:
         visited = *self._state.places.names[1:], *self._state.at
         return tuple(reversed(dict.fromkeys(reversed(visited))))
 
-    def calibration(
-        self, measure: MeasureOnFrames | None = None, *, sources: bool = False
-    ) -> Calibration:
-        """The present estimate as a batch's result; posteriors by images widen its error bars."""
+    def calibration(self, *, sources: bool = False) -> Calibration:
+        """The present estimate as a batch's result."""
         graph = self._graph_of(self._state)
         self._estimate = self._estimate or graph.solve(self._state)
-        return to_calibration(self._state, graph, self._estimate, measure, sources=sources)
+        return to_calibration(self._state, graph, self._estimate, sources=sources)
 
     @property
     def graph(self) -> gtsam.NonlinearFactorGraph:
