@@ -19,7 +19,7 @@ from calibgraph.model.summary import summarize
 from calibgraph.model.verdict import START, Check, Status, Verdict
 from calibgraph.report.as_json import finite
 from calibgraph.solver.error_model import Conflict
-from calibgraph.tracking.estimate import EpochGraph, Estimate, error_sources
+from calibgraph.tracking.estimate import Estimate
 from calibgraph.tracking.events import Event
 from calibgraph.tracking.frame_order import StreamFrame
 from calibgraph.tracking.noise import median
@@ -171,9 +171,7 @@ def second_moments(estimate: Estimate) -> Array:
     return np.asarray(window.covariance(keys) + np.outer(away, away))
 
 
-def to_calibration(
-    state: State, graph: EpochGraph, estimate: Estimate, *, sources: bool = False
-) -> Calibration:
+def to_calibration(state: State, estimate: Estimate) -> Calibration:
     """The present estimate as a result of the same type as a batch's."""
     joint = estimate.covariance
     known = None if np.isnan(joint).any() else joint
@@ -191,7 +189,6 @@ def to_calibration(
         timings_s={},
         terms="full",
         config=state.config,
-        error_sources=error_sources(state, graph, known) if sources else {},
         moves=tuple(map(str, state.moves)),
     )
 

@@ -198,7 +198,7 @@ def _at_the_end(verdict: Verdict) -> Verdict:
 
 def _result(tracker: IncrementalCalibrator, state: Path) -> Calibration:
     try:
-        return tracker.calibration(sources=True)
+        return tracker.calibration()
     except UNSOLVABLE as error:
         why = str(error).strip().partition("\n")[0]
         raise CalibrationError(

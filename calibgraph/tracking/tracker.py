@@ -6,12 +6,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise, takewhile
 from pathlib import Path
 
-import gtsam
 import numpy as np
 
 from calibgraph.errors import CorrespondenceError, FileError
 from calibgraph.files import require_file, write_bytes
-from calibgraph.graph.latent_poses import latent_pose_graph
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences, concatenate
@@ -117,23 +115,11 @@ class IncrementalCalibrator:
         visited = *self._state.places.names[1:], *self._state.at
         return tuple(reversed(dict.fromkeys(reversed(visited))))
 
-    def calibration(self, *, sources: bool = False) -> Calibration:
+    def calibration(self) -> Calibration:
         """The present estimate as a batch's result."""
         graph = self._graph_of(self._state)
         self._estimate = self._estimate or graph.solve(self._state)
-        return to_calibration(self._state, graph, self._estimate, sources=sources)
-
-    @property
-    def graph(self) -> gtsam.NonlinearFactorGraph:
-        """The graph whose optimum and marginal are reported, as :meth:`Solution.graph`.
-
-        Its variables are those of ``calibgraph.graph.variables``; the matches of a camera at a
-        place are one factor. With a preset of the paper it is Eq. 5, without its marginal.
-        """
-        graph = self._graph_of(self._state)
-        if self.config.preset != "auto":
-            return graph.equation_5_graph(self._state)
-        return latent_pose_graph(graph.whole_model(self._state))
+        return to_calibration(self._state, self._estimate)
 
     def update(
         self, table: Correspondences, *, frame: int | None = None, place: str | int | None = None
