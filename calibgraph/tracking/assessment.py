@@ -21,7 +21,7 @@ from calibgraph.report.as_json import finite
 from calibgraph.solver.error_model import Conflict
 from calibgraph.tracking.estimate import Estimate
 from calibgraph.tracking.events import Event
-from calibgraph.tracking.frame_order import StreamFrame
+from calibgraph.tracking.frames import StreamFrame
 from calibgraph.tracking.noise import median
 from calibgraph.tracking.state import COUNTS, State
 from calibgraph.tracking.sums import Numbers, Sums

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -20,41 +19,12 @@ from calibgraph.model.rig import Rig
 from calibgraph.pipeline import calibrate
 from calibgraph.progress import no_progress
 from calibgraph.solver.joint import solve_joint
-from calibgraph.tracking.frame_order import StreamFrame
-from calibgraph.tracking.streams import Item, frames_of_table
+from calibgraph.tracking.frames import Item, StreamFrame, frames_of_table
 from calibgraph.tracking.sums import MOST_PLACES
 from calibgraph.tracking.tracker import IncrementalCalibrator
 
 MOST_AGAIN = 200
 """Frames that a restart looks at again, at 0.1 s each, to find where the vehicle is."""
-
-
-@dataclass
-class Stop:
-    """Whether a signal to stop has come; called for the answer.
-
-    Attributes:
-        received: set by the first signal.
-        interrupts: whether that signal is raised, too, as KeyboardInterrupt.
-    """
-
-    received: bool = False
-    interrupts: bool = False
-
-    def __call__(self) -> bool:
-        """Whether it has come."""
-        return self.received
-
-    @contextmanager
-    def interruptible(self) -> Iterator[None]:
-        """Within, the signal raises KeyboardInterrupt; so does one that has come before."""
-        self.interrupts = True
-        try:
-            if self.received:
-                raise KeyboardInterrupt
-            yield
-        finally:
-            self.interrupts = False
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,7 @@ from calibgraph import (
     Rig,
 )
 from calibgraph.tracking.assessment import json_lines
-from calibgraph.tracking.frame_order import StreamFrame
+from calibgraph.tracking.frames import StreamFrame
 from tests.conftest import make_camera
 from tests.draws.drives import simulate_drive
 from tests.draws.places import Drawn
