@@ -53,7 +53,6 @@ from calibgraph.model.config import Reported
 from factors import (
     displaced_between_factor,
     placed_factor,
-    robust_noise,
     to_runs,
 )
 
@@ -324,4 +323,5 @@ def _noise(covariance: Array) -> gtsam.noiseModel.Gaussian:
 
 def _robust(covariance: Array, scale: float) -> gtsam.noiseModel.Base:
     noise = _noise(covariance)
-    return noise if np.isinf(scale) else robust_noise(noise, loss="geman_mcclure", scale=scale)
+    loss = gtsam.noiseModel.mEstimator.GemanMcClure.Create(scale)
+    return noise if np.isinf(scale) else gtsam.noiseModel.Robust.Create(loss, noise)
