@@ -147,8 +147,7 @@ CAUSES: dict[str, Cause] = {
         "",
         {"free": "Give correspondences over the whole image, and at several distances.",
          "no_error_bar": "Mend the camera whose pose is free, or leave it out.",
-         "sigma_rotation": "", "sigma_translation": "", "flat_evidence": "", "went_on": _STRUCTURE,
-         "beyond_tolerance": _STRUCTURE},
+         "sigma_rotation": "", "sigma_translation": "", "flat_evidence": "", "went_on": _STRUCTURE},
     ),
     "other": Cause("", {}),  # of another version
 }
