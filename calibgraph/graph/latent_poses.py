@@ -32,7 +32,6 @@ from calibgraph.arrays import Array
 from calibgraph.graph.by_place import (
     BlockByPlace,
     PairByPlace,
-    QuadraticByPlace,
 )
 from calibgraph.graph.components import EXACT, VarianceComponents, shown_distortion
 from calibgraph.graph.lens import LensTerm, lens_graph
@@ -57,8 +56,6 @@ from factors import (
     to_runs,
 )
 
-Data = BlockByPlace | QuadraticByPlace
-
 
 @dataclass(frozen=True, eq=False)
 class LatentPoseModel:
@@ -66,7 +63,7 @@ class LatentPoseModel:
 
     Attributes:
         cameras: their names.
-        blocks: correspondences, per camera that has some, or the quadratics that are left of them.
+        blocks: correspondences, per camera that has some.
         pairs: camera-to-camera matches.
         pose_graph: priors and measured relative poses, on ``x_c``; marginals of places that are
             not in the graph, on ``o`` and ``m_c``.
@@ -80,7 +77,7 @@ class LatentPoseModel:
     """
 
     cameras: tuple[str, ...]
-    blocks: Mapping[str, Data]
+    blocks: Mapping[str, BlockByPlace]
     pairs: Sequence[PairByPlace]
     pose_graph: gtsam.NonlinearFactorGraph
     components: VarianceComponents
@@ -278,10 +275,7 @@ def latent_pose_graph(model: LatentPoseModel) -> gtsam.NonlinearFactorGraph:
 
 
 def data_graph(model: LatentPoseModel) -> gtsam.NonlinearFactorGraph:
-    """One factor per camera and place, and one per pair and place; lossless.
-
-    A summary of earlier correspondences is another factor of its camera and place.
-    """
+    """One factor per camera and place, and one per pair and place; lossless."""
     graph = gtsam.NonlinearFactorGraph()
     for place, camera in model.matched_places:
         keys = [cloud_at_key(place), matched_at_key(place, camera), *model.lens_keys(camera)]
