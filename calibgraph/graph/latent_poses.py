@@ -279,8 +279,7 @@ def data_graph(model: LatentPoseModel) -> gtsam.NonlinearFactorGraph:
     graph = gtsam.NonlinearFactorGraph()
     for place, camera in model.matched_places:
         keys = [cloud_at_key(place), matched_at_key(place, camera), *model.lens_keys(camera)]
-        for factor in model.blocks[model.cameras[camera]].factors(place, keys):
-            graph.add(factor)
+        graph.add(model.blocks[model.cameras[camera]].factor(place, keys))
     for pair in model.pairs:
         key_a, key_b = (paired_key(model.cameras.index(name)) for name in (pair.a, pair.b))
         for place, (first, end) in zip(pair.places.tolist(), to_runs(pair.edges), strict=True):

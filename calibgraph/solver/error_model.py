@@ -120,8 +120,7 @@ def refine_with_error_model(
     if found is None:
         return None, optimum
     found = replace(found, without_priors=free)
-    iterations = optimum.iterations + found.iterations
-    return found, Optimum(found.T_camera_lidar, found.cost, iterations, found.converged)
+    return found, Optimum(found.T_camera_lidar, found.cost, found.converged)
 
 
 def fit_without_priors(

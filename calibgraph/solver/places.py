@@ -403,7 +403,6 @@ class ErrorFit:
 
     Attributes:
         linear: the graph linearized there.
-        iterations: number of Gauss-Newton steps.
         change: of the cost by the last step, relative to it.
         keys: of the poses that are reported.
         ratios: of its variance components.
@@ -412,7 +411,6 @@ class ErrorFit:
     """
 
     linear: Linearization
-    iterations: int
     change: float
     keys: Sequence[int]
     ratios: VarianceRatios = VarianceRatios()
@@ -496,17 +494,19 @@ def fit_latent_poses(
     present = start if start.model is model else start.with_model(model)
     if not (is_determined or present.is_determined()):
         return None
-    iterations, change = 0, np.inf
-    while iterations < MAX_ITERATIONS and change > relative_tolerance:
+    change = np.inf
+    for _ in range(MAX_ITERATIONS):
         try:
             found = present.descend()
         except np.linalg.LinAlgError:
             return None
         if found is None:  # this is the minimum, to rounding
-            return ErrorFit(present, iterations, 0.0, model.reported_keys)
+            return ErrorFit(present, 0.0, model.reported_keys)
         change = (present.cost - found.cost) / max(present.cost, np.finfo(float).tiny)
-        present, iterations = found, iterations + 1
-    return ErrorFit(present, iterations, change, model.reported_keys)
+        present = found
+        if change <= relative_tolerance:
+            break
+    return ErrorFit(present, change, model.reported_keys)
 
 
 def start_values(model: LatentPoseModel, T_camera_lidar: Mapping[str, Array]) -> Linearization:
