@@ -10,13 +10,11 @@ import gtsam
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.graph.objective import pose_key, relative_pose_graph
+from calibgraph.graph.objective import pose_key
 from calibgraph.model.findings import error_components
 from calibgraph.model.geometry import pose_rows, to_T_lidar_camera
-from calibgraph.solver.pairs import rows_of_pair
 from calibgraph.solver.two_pass import Objective, Scales, Transforms, to_values
 from factors import BlockSums, ProjectionBlock
-from factors.conditioning import sigmas_of_hessian
 
 
 def convex_hessian(hessian: Array, otherwise: Array) -> Array:
@@ -152,25 +150,3 @@ def with_pseudo_frames(
 def _along(vectors: Array, matrix: Array) -> Array:
     """(..., n) v^T M v of each column v."""
     return np.asarray((vectors * (matrix @ vectors)).sum(axis=-2))
-
-
-def data_sigmas(at: FittedObjective) -> Array:
-    """Standard deviations if every correspondence were independent.
-
-    A lower bound of the true uncertainty: it shows the directions that the data do not determine.
-    Measured relative poses and camera pairs count, priors do not.
-
-    Returns:
-        (N, 6) standard deviations per camera: rotation [rad], translation [m], in its axes;
-        infinite in directions without information.
-    """
-    objective, cameras, T_camera_lidar = at.objective, at.cameras, at.T_camera_lidar
-    measured = relative_pose_graph(objective.cameras, objective.rig.relative_poses)
-    hessian = pose_equations(measured, cameras, T_camera_lidar)[0]
-    for name, sums in at.frame_sums.items():
-        rows = pose_rows(cameras.index(name))
-        hessian[rows, rows] += sums.hessian.sum(axis=0)
-    for pair in objective.pairs:
-        both = rows_of_pair(cameras, pair)
-        hessian[np.ix_(both, both)] += pair.sums(T_camera_lidar).hessian
-    return sigmas_of_hessian(hessian).reshape(-1, 6)

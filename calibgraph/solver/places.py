@@ -217,18 +217,10 @@ class Linearization:
         return Ties.of(shared, self.inverses, covariance, parts.robust_scale)
 
     @property
-    def weights(self) -> Array:
-        """(P, 1 + N) of the cloud and of each camera at each place, in the robust loss."""
-        return self._by_camera(self.ties.weight, 1.0)
-
-    @property
     def distances(self) -> Array:
         """(P, 1 + N) in sigmas: of o_p from o, of a_cp from m_c; 0 where there are no data."""
-        return self._by_camera(self.ties.distance, 0.0)
-
-    def _by_camera(self, rows: Array, otherwise: float) -> Array:
-        found = np.full((self.model.places, 1 + len(self.model.cameras)), otherwise)
-        found[:, [0, *(1 + number for number in self.model.matched)]] = rows.T
+        found = np.zeros((self.model.places, 1 + len(self.model.cameras)))
+        found[:, [0, *(1 + number for number in self.model.matched)]] = self.ties.distance.T
         return found
 
     @cached_property

@@ -16,6 +16,7 @@ from calibgraph.solver.solution import Solution
 from calibgraph.trust.evidence import Checks, Estimate, Evidence
 from calibgraph.trust.thresholds import threshold
 from factors.columns import CLOCK
+from factors.conditioning import invert_or_none
 
 
 def estimate_checks(evidence: Evidence) -> Checks:
@@ -25,13 +26,13 @@ def estimate_checks(evidence: Evidence) -> Checks:
 
 def _estimate_of(evidence: Evidence, camera: str) -> Estimate:
     solution, block = evidence.solution, evidence.solution.inliers.blocks.get(camera)
-    sigmas = None if evidence.joint_covariance is not None else solution.data_sigmas
+    unknown, own = evidence.joint_covariance is None, solution.fitted.frame_sums.get(camera)
     return Estimate(
         has_matches=camera in solution.objective.blocks,
         used=0 if block is None else len(block.frame),
         frames=0 if block is None else len(block.frame_edges) - 1,
         covariance=evidence.covariance_by_matches(camera),
-        is_free=sigmas is not None and np.isinf(sigmas[evidence.cameras.index(camera)]).any(),
+        is_free=unknown and own is not None and invert_or_none(own.hessian.sum(axis=0)) is None,
         conflicts=tuple(c for c in solution.conflicts if camera in (c.pair.a, c.pair.b)),
         converged=solution.optimum.converged,
         terms=solution.terms,

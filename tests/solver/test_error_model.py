@@ -170,7 +170,7 @@ def of_matches(errors: ErrorFit) -> np.ndarray:
     From the dense covariance C: C G C, with G the information of each of these.
     """
     linear = errors.linear
-    weight, values, parts = linear.weights, all_values(linear), errors.model.components
+    weight, values, parts = linear.ties.weight.T, all_values(linear), errors.model.components
     cameras = weight[:, 1:, None, None]
     parts = replace(
         parts,
