@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
@@ -65,11 +65,11 @@ def refine_with_pairs(
     for step in range(steps):
         now = now if step == 0 else np.array([term.sigma_px(T) for term in terms])
         sigmas = least * np.maximum(now / least, 1.0) ** (1.0 - (step + 1) / steps)
-        scaled = tuple(t.with_sigma(s) for t, s in zip(terms, sigmas.tolist(), strict=True))
-        near = replace(inliers, pairs=scaled)
+        scaled = [t.with_sigma(s) for t, s in zip(terms, sigmas.tolist(), strict=True)]
+        near = inliers.with_pairs(scaled)
         T = near.minimize(T, at.scales, tolerance=_COARSE).T_camera_lidar
-    kept = tuple(t.without_outliers(T, s) for t, s in zip(scaled, sigmas.tolist(), strict=True))
-    joined = replace(inliers, pairs=kept)
+    kept = [t.without_outliers(T, s) for t, s in zip(scaled, sigmas.tolist(), strict=True)]
+    joined = inliers.with_pairs(kept)
     return joined, joined.minimize(T, at.scales)
 
 
