@@ -243,7 +243,7 @@ def track(
     out: Path = Option(
         Path("tracking"),
         metavar="DIR",
-        help="Folder for the state, the result and a picture. A state in it is resumed.",
+        help="Folder for the state and the result. A state in it is resumed.",
     ),
     step: int = Option(1, min=1, help="With --matcher: match every N-th frame only."),
     matcher: str | None = Option(None, metavar="NAME", help="Match frames: structure or cmrnext."),
