@@ -52,7 +52,7 @@ def clouds(_: Path) -> dict[str, bytes]:
         "packed.pcd": pcd("binary_compressed"), "little.ply": ply(), "ascii.ply": ply("ascii"),
         "big.ply": ply("binary_big_endian"),
         "mesh.ply": ply(after=faces),
-        "four.bin": body, "three.bin": CLOUD[:, :3].tobytes(), "array.npy": npy.getvalue(),
+        "four.bin": body, "array.npy": npy.getvalue(),
     }  # fmt: skip
 
 

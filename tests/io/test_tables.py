@@ -269,9 +269,7 @@ def test_rows_that_a_file_cannot_hold_are_refused_by_its_footer(tmp_path: Path) 
 @pytest.mark.parametrize(
     ("content", "words"),
     [(b"camera;frame\na;0\n", "separated by semicolons"),
-     (b"camera\tframe\na\t0\n", "separated by tabs"),
-     ("camera,frame\na,0\n".encode("utf-16"), "is UTF-16"),
-     ("camera,frame\na,0\n".encode("utf-16-le"), "is UTF-16")],
+     (b"camera\tframe\na\t0\n", "separated by tabs")],
 )  # fmt: skip
 def test_csv_as_other_programs_save_it_is_named(content: bytes, words: str, tmp_path: Path) -> None:
     (tmp_path / "table.csv").write_bytes(content)
