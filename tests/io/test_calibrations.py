@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from calibgraph import FileError, load_calibration, load_correspondences, load_rig
-from calibgraph.io.calibrations import error_bars
+from calibgraph.io.calibrations import stated_result
 from calibgraph.report.html import write_result
 from tests.conftest import CommandRun
 
@@ -182,7 +182,7 @@ def test_a_covariance_that_is_none_is_refused(
     covariance = content_of(calibrated_sample)["covariance"]
     covariance["left"][place[0]][place[1]] = value
     path = edited({"covariance": covariance}, calibrated_sample, tmp_path)
-    for read in (load_calibration, error_bars):
+    for read in (load_calibration, stated_result):
         with pytest.raises(FileError, match=f"covariance.left: .*{words}"):
             read(path)
 
@@ -201,7 +201,7 @@ def test_whether_an_error_bar_holds_is_true_or_false(
 ) -> None:
     path = edited({"error_bar_holds": {"left": "yes"}}, calibrated_sample, tmp_path)
     with pytest.raises(FileError, match="error_bar_holds.left"):
-        error_bars(path)
+        stated_result(path)
 
 
 def test_unknown_settings_are_refused(calibrated_sample: CommandRun, tmp_path: Path) -> None:
