@@ -19,7 +19,7 @@ from calibgraph import (
     simulate_correspondences,
 )
 from calibgraph.model.places import Places
-from tests.cli.conftest import save_problem
+from tests.cli.conftest import error_line, save_problem
 from tests.conftest import SAMPLE, Call, CommandRun, make_camera, run_command
 
 
@@ -161,6 +161,9 @@ def test_a_failed_calibration_exits_1_and_its_files_are_marked(problem: Path, ca
     ]
     content = yaml.safe_load((out / "calibration.yaml").read_text())
     assert content["error_bar_holds"]["left->right"] is False
+    export = ("export", out, "--format", "json", "--out", problem / "a.json")
+    assert "is FAIL, nothing was written" in error_line(*call(*export))
+    assert call(*export, "--even-if-failed")[0] == 0
 
 
 def test_calibrate_writes_a_result_a_report_and_pictures(calibrated_sample: CommandRun) -> None:
