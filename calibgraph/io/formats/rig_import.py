@@ -26,8 +26,6 @@ from calibgraph.io.kitti import CALIBRATION_NAME, NumberLines
 from calibgraph.io.lenses import CameraLens
 from calibgraph.io.rig_parts import (
     ONLY_CAMERA,
-    RELATIVE_SIGMA_CM,
-    RELATIVE_SIGMA_DEG,
     Link,
     Links,
     RelativeCamera,
@@ -465,8 +463,6 @@ def import_rig(
     lidar_frame: str | None = None,
     camera_frames: Mapping[str, str] | None = None,
     size_px: tuple[int, int] | None = None,
-    relative_sigma_deg: float = RELATIVE_SIGMA_DEG,
-    relative_sigma_cm: float = RELATIVE_SIGMA_CM,
 ) -> Rig:
     """Build a rig from files of other programs, which together hold lenses and extrinsics.
 
@@ -477,8 +473,6 @@ def import_rig(
         lidar_frame: the LiDAR's frame among those of the files; the one with such a name if None.
         camera_frames: per camera, its frame, where the names differ.
         size_px: width and height of images whose file has none.
-        relative_sigma_deg: 1 sigma per axis of relative poses whose file has none.
-        relative_sigma_cm: likewise of their translation.
 
     Raises:
         CalibrationError: if a file is malformed, a lens is none of ours, or something is missing.
@@ -486,9 +480,7 @@ def import_rig(
     parts = read_rig_parts(
         files, names=names, rename=rename, lidar_frame=lidar_frame, camera_frames=camera_frames
     )
-    return parts.to_rig(
-        size_px=size_px, relative_sigma_deg=relative_sigma_deg, relative_sigma_cm=relative_sigma_cm
-    )
+    return parts.to_rig(size_px=size_px)
 
 
 def read_rig_parts(

@@ -267,12 +267,12 @@ def test_up_and_down_and_the_axis_z_are_in_the_sentences() -> None:
 
 def test_a_camchain_is_described_with_its_relative_pose(tmp_path: Path) -> None:
     files = saved({"camchain.yaml": TEXTS["camchain"]}, tmp_path)
-    rig = import_rig(files, relative_sigma_deg=0.2)
+    rig = import_rig(files)
     assert describe_rig(rig) == [
         "cam0 looks along LiDAR +x, sits 0.40 m ahead, 0.10 m left and 0.20 m below the LiDAR",
         "cam1 looks along LiDAR +x, sits 0.40 m ahead, 0.01 m right and 0.20 m below the LiDAR",
         "cam0 sits 0.11 m left of cam1, in the axes of cam1, turned by 0.0 deg against it "
-        "(1 sigma: 0.2 deg, 0.5 cm)",
+        "(1 sigma: 0.1 deg, 0.5 cm)",
     ]
 
 
