@@ -13,11 +13,6 @@ from calibgraph import MatcherErrors, Rig, simulate_correspondences
 from tests.conftest import SAMPLE, Call
 
 
-@pytest.fixture
-def truth() -> Rig:
-    return calibgraph.load_rig(SAMPLE / "reference.yaml")
-
-
 @pytest.mark.slow
 def test_a_failure_marks_every_file_and_exits_1(call: Call, tmp_path: Path, truth: Rig) -> None:
     """Random correspondences: FAIL in the result, in the table, in the pictures, on the page."""
