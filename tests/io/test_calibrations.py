@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import errno
+from copy import deepcopy
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,8 @@ from calibgraph import FileError, load_calibration, load_correspondences, load_r
 from calibgraph.io.calibrations import stated_result
 from calibgraph.report.html import write_result
 from tests.conftest import CommandRun
+
+pytestmark = pytest.mark.usefixtures("blank_diagrams")
 
 WRONG: dict[str, Any] = {
     "covariance": {"left": [[1.0]]},
@@ -157,11 +161,15 @@ def test_a_result_of_much_metadata_is_replaced_but_no_table_of_others(
     assert load_correspondences(path).metadata == long.metadata
 
 
+@cache
+def read_once(path: Path) -> dict[str, Any]:
+    content: dict[str, Any] = yaml.load(path.read_text(), Loader=yaml.CSafeLoader)
+    return content
+
+
 def content_of(result: CommandRun) -> dict[str, Any]:
     """The sample's result, as its file holds it."""
-    text = (result.folder / "calibration.yaml").read_text()
-    content: dict[str, Any] = yaml.load(text, Loader=yaml.CSafeLoader)
-    return content
+    return deepcopy(read_once(result.folder / "calibration.yaml"))
 
 
 def edited(change: dict[str, Any], result: CommandRun, folder: Path) -> Path:

@@ -70,11 +70,6 @@ def test_the_lidars_mounting_moves_sensors_together(tmp_path: Path) -> None:
         np.testing.assert_allclose(T, rig.T_camera_lidar[name], atol=1e-9)
 
 
-def test_other_formats_refuse_the_lidars_mounting(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="autoware only"):
-        export_calibration(varied_rig(), tmp_path / "a.urdf", "urdf", T_base_lidar=LIDAR_POSE)
-
-
 def test_names_of_frames_can_be_chosen(tmp_path: Path) -> None:
     path = tmp_path / "a.urdf"
     export_calibration(
@@ -206,13 +201,6 @@ def test_files_that_are_there_are_replaced_only_with_force(tmp_path: Path) -> No
     assert path.read_text() == before
     export_calibration(path, path, "kalibr", force=True)
     assert path.read_text() != before
-
-
-def test_unknown_formats_and_cameras_are_named(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="format 'ros': known are kalibr, ros2-launch"):
-        export_calibration(make_pair(), tmp_path / "a", "ros")
-    with pytest.raises(ValueError, match="camera 'rear': the rig has left, right"):
-        export_calibration(make_pair(), tmp_path / "a", "json", cameras=["rear"])
 
 
 _KEYS = [
