@@ -22,9 +22,9 @@ from calibgraph.io.bags.rig import doubtful_axes
 from calibgraph.io.bags.storage import NEAR_S, REPAIR_ROS2
 from calibgraph.io.clouds import (
     RawCloud,
-    check_points,
     cloud_of_array,
     describe_cloud,
+    only_returns,
     with_intensity,
 )
 from calibgraph.io.dataset_folders import folder_layout, frames_of_folder, published_folder
@@ -368,7 +368,7 @@ def _cloud(cloud: ArrayLike, number: int) -> RawCloud:
     name = f"clouds[{number}]"
     try:
         found = cloud_of_array(_array(cloud, name), name)
-        return found._replace(points=check_points(found.points, name))
+        return only_returns(found, name)
     except FileError as error:
         raise DatasetError(str(error), frame=number) from None
 

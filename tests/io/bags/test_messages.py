@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from calibgraph import DatasetError, load_dataset
 from calibgraph.io.bags.messages import LIVOX_CLOUDS, read_custom_msg
 from calibgraph.io.bags.pictures import image_from_message, is_depth
-from calibgraph.io.bags.point_clouds import cloud_from_message, has_points, time_fields
+from calibgraph.io.bags.point_clouds import cloud_from_message, has_points
+from calibgraph.io.clouds import time_fields
 from tests.conftest import SAMPLE
 from tests.io.bags.writing import (
     KINDS,
