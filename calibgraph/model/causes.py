@@ -114,7 +114,7 @@ CAUSES: dict[str, Cause] = {
     ),
     "frames": Cause(
         _FRAMES,
-        {"outlier_frames": "", "place_distance": "", "place_inliers": "", "bootstrap_sigma": "",
+        {"outlier_frames": "", "place_distance": "", "place_inliers": "",
          "disagreeing_frames": "Check whether the camera was moved.",
          "drift": "Check whether the camera's mount is loose."},
     ),

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
-from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import BeforeValidator, ConfigDict, Field, ValidationError
 
 from calibgraph.files import StrictNumbers, checked_model, describe, read_yaml
 from calibgraph.model.verdict import TOLERANCE
@@ -51,12 +51,6 @@ class Tracking(StrictNumbers):
     blind_frames: Annotated[int, Field(ge=2, le=100_000)] = 20
 
 
-def _not_one(draws: int) -> int:
-    if draws == 1:
-        raise ValueError("one draw has no scatter; give 0 for none, or at least 2")
-    return draws
-
-
 def _lens_parts(value: Any) -> Any:
     """The names of parts, also with commas between them; ``lens`` and ``clock`` stand for more."""
     names = [*map(str.strip, value.split(","))] if isinstance(value, str) else value
@@ -95,8 +89,6 @@ class Config(StrictNumbers):
         tolerance_cm: distance by which a camera may be off: the verdict is about more.
         common_deg, common_cm: standard deviation per camera axis of the error that all frames of a
             table share, if the table does not state it; 0 if they share none.
-        bootstrap: how many draws of frames, with replacement, whose scatter checks the
-            covariance; 0 for none.
         of: the poses that are reported: ``alignment``, where the points, as this LiDAR delivers
             them, meet the images; or ``mount``, where the sensors are, with a wider error bar.
         estimate: parts of each lens that are estimated with the extrinsics, by ``calibrate`` and
@@ -127,7 +119,6 @@ class Config(StrictNumbers):
     tolerance_cm: Annotated[float, Field(gt=0, le=1e6)] = TOLERANCE[1]
     common_deg: Annotated[float, Field(ge=0, le=180)] | None = None
     common_cm: Annotated[float, Field(ge=0, le=10_000)] | None = None
-    bootstrap: Annotated[int, Field(ge=0, le=100_000), AfterValidator(_not_one)] = 0
     of: Reported = "alignment"
     estimate: Annotated[tuple[LensPart, ...], BeforeValidator(_lens_parts)] = ()
     seed: Seed = 0
@@ -171,6 +162,8 @@ _PRESETS: dict[str, dict[str, Any]] = {
         "learnt_weights": False,
     },
 }
+FORMER_SETTINGS = {"loss": "cauchy", "bootstrap": 0}
+"""Those of results of earlier versions with the values that are the only ones now."""
 PRESETS: tuple[PresetName, ...] = get_args(PresetName)
 
 

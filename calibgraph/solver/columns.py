@@ -233,8 +233,8 @@ class DistortionEvidence:
         jacobian: (6, 3) displacement of their pose by a unit of each distortion.
         hessian: (6, 6) J^T J of all matches plus the weak prior: the weight of ``jacobian`` in a
             mean over several sets of matches.
-        information: (P, 3, 3) of the residuals at each place, if all matches were independent.
-        vector: (P, 3) the information times the distortions that the residuals show.
+        information: (3, 3) of the residuals, if all matches were independent.
+        vector: (3,) the information times the distortions that the residuals show.
         lens_jacobian: (k, 3) displacement of a free lens, likewise; of a fixed one, (0, 3).
     """
 
@@ -243,11 +243,6 @@ class DistortionEvidence:
     information: Array
     vector: Array
     lens_jacobian: Array = field(default_factory=lambda: np.zeros((0, len(DISTORTION))))
-
-    def as_of_one_place(self) -> DistortionEvidence:
-        """The sum over places."""
-        information, vector = self.information.sum(axis=0), self.vector.sum(axis=0)
-        return replace(self, information=information[None], vector=vector[None])
 
 
 def distortion_evidence(
@@ -298,9 +293,8 @@ def distortion_evidence(
     left = hessian[:, bends, bends] + turned @ across
     left = left + (across.transpose(0, 2, 1) + turned @ own) @ follow
     pull = sums.gradient[:, bends] + np.einsum("pij,pi->pj", follow[:-1], sums.gradient[:, moves])
-    whole = own[-1] / share + weak
-    jacobian, of_lens = follow[-1, :6], follow[-1, 6:]
-    return DistortionEvidence(jacobian, whole[:6, :6], left[:-1] / share, pull / share, of_lens)
+    whole, shown = own[-1] / share + weak, (left[:-1].sum(axis=0) / share, pull.sum(axis=0) / share)
+    return DistortionEvidence(follow[-1, :6], whole[:6, :6], *shown, follow[-1, 6:])
 
 
 def pair_jacobians(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import gtsam
@@ -61,12 +60,6 @@ class PairTerm:
         """Its cameras."""
         return frozenset((self.a, self.b))
 
-    @cached_property
-    def frame_edges(self) -> NDArray[np.int64]:
-        """(f + 1,) where the frames begin, and the end."""
-        new = np.flatnonzero(np.diff(self.frame)) + 1
-        return np.concatenate([[0], new, [len(self.frame)]])
-
     def select(self, rows: NDArray[Any]) -> PairTerm:
         """Some rows: a mask, or an index array in rising order."""
         return replace(self, block=self.block.select(rows), frame=self.frame[rows])
@@ -93,12 +86,6 @@ class PairTerm:
     def sums(self, T_camera_lidar: Mapping[str, Array]) -> BlockSums:
         """H (12, 12), b (12,) and c, in the tangents of ``T_lidar_a`` and ``T_lidar_b``."""
         return self.block.sums(*self._poses(T_camera_lidar))
-
-    def frame_sums(self, T_camera_lidar: Mapping[str, Array]) -> tuple[Array, Array]:
-        """(f, 12, 12) H and (f, 12) b of each frame."""
-        a, b = (pose.matrix()[None] for pose in self._poses(T_camera_lidar))
-        sums = self.block.run_sums(a, b, self.frame_edges)
-        return sums.hessian, sums.gradient
 
     def _poses(self, T_camera_lidar: Mapping[str, Array]) -> tuple[gtsam.Pose3, gtsam.Pose3]:
         return (

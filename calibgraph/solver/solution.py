@@ -22,7 +22,7 @@ from calibgraph.model.error_sources import ErrorSources
 from calibgraph.model.geometry import pose_rows
 from calibgraph.model.lens import LensEstimate
 from calibgraph.model.rig import Rig
-from calibgraph.solver.covariance import FittedObjective, data_sigmas
+from calibgraph.solver.covariance import FittedObjective
 from calibgraph.solver.error_model import (
     Conflict,
     fit_errors,
@@ -153,11 +153,6 @@ class Solution:
         if self.error_fit is not None and self.config.preset == "auto":
             return latent_pose_graph(self.error_fit.model)
         return self.inliers.graph(self.scales)
-
-    @cached_property
-    def data_sigmas(self) -> Array | None:
-        """(N, 6) standard deviations if every correspondence were independent."""
-        return data_sigmas(self.fitted) if self.objective.uses_correspondences else None
 
     def error_sources(self, joint: Array) -> dict[str, ErrorSources]:
         """Per camera with an error bar, the shares of its sources.

@@ -45,13 +45,11 @@ class Optimum:
     Attributes:
         T_camera_lidar: per camera, (4, 4).
         cost: the paper's objective there (twice GTSAM's error).
-        iterations: of LM.
         converged: whether it stopped by its tolerance.
     """
 
     T_camera_lidar: dict[str, Array]
     cost: float
-    iterations: int
     converged: bool
 
 
@@ -82,8 +80,7 @@ def optimize(
     optimizer = gtsam.LevenbergMarquardtOptimizer(graph, start, _parameters(tolerance))
     values = optimizer.optimize()
     found = {name: to_T_camera_lidar(values.atPose3(pose_key(cameras, name))) for name in cameras}
-    iterations = int(optimizer.iterations())
-    return Optimum(found, 2.0 * optimizer.error(), iterations, iterations < MAX_ITERATIONS)
+    return Optimum(found, 2.0 * optimizer.error(), optimizer.iterations() < MAX_ITERATIONS)
 
 
 @cache
@@ -185,7 +182,7 @@ class Objective:
     ) -> Optimum:
         """The minimum by Levenberg-Marquardt, with the residuals' scales held constant."""
         if self.terms == "stage1":
-            return Optimum(start, math.nan, 0, True)
+            return Optimum(start, math.nan, True)
         return optimize(self._joined(scales), self.cameras, start, tolerance=tolerance)
 
     def _joined(self, scales: Scales) -> gtsam.NonlinearFactorGraph:

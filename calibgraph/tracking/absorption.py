@@ -333,7 +333,7 @@ def bend_epoch(state: State, epoch: int, camera: int) -> None:
             places = [np.array(of_place, dtype=np.int64) for of_place in at.values()]
             pose = to_T_lidar_camera(state.poses[epoch, camera])
             scale = state.scales[camera]
-            one = distortion_evidence(block, scale, pose, WEAK, places=places).as_of_one_place()
+            one = distortion_evidence(block, scale, pose, WEAK, places=places)
             pulled = one.hessian @ one.jacobian
             parts = one.hessian, pulled, one.information, one.vector
             found = np.concatenate([part.ravel() for part in parts])

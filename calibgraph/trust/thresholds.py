@@ -127,9 +127,6 @@ THRESHOLDS: tuple[Threshold, ...] = (
     Threshold("assumed_spread", "residual spread over the assumed one", "at most", 2.0, 4.0,
               "times", "Does the configured loss scale suit the residuals?",
               "the matches are worse than loss_scale_px (delta) assumes"),
-    Threshold("bootstrap_sigma", "bootstrap sigma over reported sigma", "at most", 2.0, 5.0, "",
-              "Does a bootstrap over frames give the reported covariance?",
-              "the frames disagree more than the error bar allows"),
     # Above half, it shows the priors more than the data.
     Threshold("prior_share", "share of the priors in the result", "at most", 0.5, 1.0, "share",
               "How much of the result comes from priors and relative poses?"),

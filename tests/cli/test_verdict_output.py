@@ -32,12 +32,12 @@ def test_a_failure_marks_every_file_and_exits_1(call: Call, tmp_path: Path, trut
 def test_the_error_bar_of_cameras_and_pairs_is_printed(
     call: Call, tmp_path: Path, pair: Rig
 ) -> None:
-    (tmp_path / "config.yaml").write_text("bootstrap: 5\n")
+    (tmp_path / "config.yaml").write_text("seed: 5\n")
     solve = words_to_solve(tmp_path, pair, frames=8, matches=100)
     command = (*solve, "--config", tmp_path / "config.yaml")
     code, _, text = call(*command)
     assert code == 0
-    for words in ("left->right", "left (bootstrap)", "Least certain: ", "would help most"):
+    for words in ("left->right", "Least certain: ", "would help most"):
         assert words in text
     assert "more findings: see report.html" in text  # the weakest directions
     code, stdout, _ = call(*command, "--json")
@@ -47,7 +47,7 @@ def test_the_error_bar_of_cameras_and_pairs_is_printed(
     content = yaml.safe_load((tmp_path / "out" / "calibration.yaml").read_text())
     assert "xi = (rotation [rad], translation [m])" in content["covariance_of"]
     assert "in the axes of B" in content["pair_covariance_of"]
-    assert content["config"]["bootstrap"] == 5
+    assert content["config"]["seed"] == 5
 
 
 def test_a_warning_for_lack_of_data_is_told_from_one_that_looks_odd(

@@ -22,7 +22,7 @@ pytestmark = pytest.mark.usefixtures("blank_diagrams")
 WRONG: dict[str, Any] = {
     "covariance": {"left": [[1.0]]},
     "joint_covariance": [[1.0]],
-    "bootstrap_covariance": {"left": [[float("nan")] * 6] * 6},
+    "pair_covariance": {"left->right": [[float("nan")] * 6] * 6},
     "stage1_T_camera_lidar": {"left": [[1.0]]},
     "camera_verdicts": {},
     "residuals": {"left": {"median_px": "large"}},
@@ -212,8 +212,13 @@ def test_whether_an_error_bar_holds_is_true_or_false(
         stated_result(path)
 
 
-def test_unknown_settings_are_refused(calibrated_sample: CommandRun, tmp_path: Path) -> None:
+def test_unknown_settings_are_refused_and_former_ones_that_changed_nothing_are_not(
+    calibrated_sample: CommandRun, tmp_path: Path
+) -> None:
     settings = content_of(calibrated_sample)["config"]
-    file = edited({"config": {**settings, "aggregate": "mean"}}, calibrated_sample, tmp_path)
-    with pytest.raises(FileError, match="unknown key 'aggregate'"):
-        load_calibration(file)
+    for key, value in (("aggregate", "mean"), ("loss", "huber")):
+        file = edited({"config": {**settings, key: value}}, calibrated_sample, tmp_path)
+        with pytest.raises(FileError, match=f"unknown key '{key}'"):
+            load_calibration(file)
+    file = edited({"config": {**settings, "loss": "cauchy"}}, calibrated_sample, tmp_path)
+    assert load_calibration(file).config == load_calibration(calibrated_sample.folder).config

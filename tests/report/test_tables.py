@@ -42,7 +42,6 @@ def extreme() -> Calibration:
         initial_rig=far,
         camera_verdicts=dict.fromkeys(NAMES, Verdict((), ErrorProbability(0.001, 0.98))),
         covariance=dict.fromkeys(NAMES, COVARIANCE),
-        bootstrap=dict.fromkeys(NAMES, COVARIANCE),
         residuals=dict.fromkeys(NAMES, Residuals(12345.678, 1.0, 1.0, 1.0, 1.0)),
         counts=dict.fromkeys(NAMES, {"used": 12_345_678, "frames_used": 100_000}),
         prior_share=dict.fromkeys(NAMES, 1.0),

@@ -170,7 +170,7 @@ def of_matches(errors: ErrorFit) -> np.ndarray:
     From the dense covariance C: C G C, with G the information of each of these.
     """
     linear = errors.linear
-    weight, values, parts = linear.weights, all_values(linear), errors.model.components
+    weight, values, parts = linear.ties.weight.T, all_values(linear), errors.model.components
     cameras = weight[:, 1:, None, None]
     parts = replace(
         parts,
@@ -193,9 +193,8 @@ def of_matches(errors: ErrorFit) -> np.ndarray:
         factor = data.at(number)
         rows = np.concatenate([starts[key] + np.arange(6) for key in list(factor.keys())])
         information[np.ix_(rows, rows)] += factor.information()
-    shown = np.einsum("pn,pnij->ij", parts.distortion_weight, parts.distortion_information)
     rows = starts[DISTORTION] + np.arange(3)
-    information[np.ix_(rows, rows)] += shown
+    information[np.ix_(rows, rows)] += parts.distortion_information
     for number, (place, camera) in enumerate(model.matched_places):
         edge = model.place_graph.at(model.places + number)
         root = edge.noiseModel().R()
