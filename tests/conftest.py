@@ -241,6 +241,12 @@ def mixed_rig() -> Rig:
 
 
 @pytest.fixture(scope="session")
+def truth() -> Rig:
+    """The sample's rig at its true poses."""
+    return load_rig(SAMPLE / "reference.yaml")
+
+
+@pytest.fixture(scope="session")
 def open3d() -> Any:
     """Open3D, which simulates sensors, and loads libraries of the system."""
     return pytest.importorskip(

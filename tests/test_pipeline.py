@@ -41,11 +41,6 @@ STATED = {
 
 
 @pytest.fixture(scope="module")
-def truth() -> Rig:
-    return calibgraph.load_rig(SAMPLE / "reference.yaml")
-
-
-@pytest.fixture(scope="module")
 def guess(truth: Rig) -> Rig:
     return perturb(truth, rotation_deg=1, translation_m=0.1, seed=3)
 

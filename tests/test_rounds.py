@@ -47,11 +47,6 @@ from tests.matching.structure.data import with_noise_images
 
 
 @pytest.fixture(scope="module")
-def truth() -> Rig:
-    return calibgraph.load_rig(SAMPLE / "reference.yaml")
-
-
-@pytest.fixture(scope="module")
 def data(truth: Rig) -> Dataset:
     return calibgraph.load_dataset(SAMPLE, truth)
 

@@ -74,12 +74,14 @@ def evaluate(
 
     Of a reference with error bars, as `calibgraph pick` writes it, in standard deviations as well.
     """
-    from calibgraph.io.calibrations import error_bars
+    from calibgraph.io.calibrations import stated_result
     from calibgraph.io.rigs import load_rig, rig_file
     from calibgraph.model.metrics import evaluate
 
     path = rig_file(estimate)
-    errors = evaluate(load_rig(estimate), load_rig(reference), error_bars(path))
+    stated = stated_result(path)
+    bars = None if stated is None else stated.error_bars
+    errors = evaluate(load_rig(estimate), load_rig(reference), bars)
     if as_json:
         print_json(asdict(errors))
     else:

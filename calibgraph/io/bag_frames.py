@@ -18,7 +18,7 @@ from calibgraph.arrays import Array
 from calibgraph.errors import DatasetError, FileError
 from calibgraph.io.bags.camera_info import StatedLens, lens_of
 from calibgraph.io.bags.messages import Bag, open_drive, read_message
-from calibgraph.io.bags.point_clouds import doubtful_time_fields, time_fields
+from calibgraph.io.bags.point_clouds import doubtful_time_fields
 from calibgraph.io.bags.stamps import (
     TopicStamps,
     after_ns,
@@ -38,6 +38,7 @@ from calibgraph.io.bags.transforms import (
     stamped_transforms,
     values_of,
 )
+from calibgraph.io.clouds import time_fields
 from calibgraph.io.frame import Frame, ScanMotion, seconds_between, twist_between, twist_by_scans
 from calibgraph.model.geometry import transform
 from calibgraph.model.rig import Camera
@@ -59,11 +60,11 @@ def motion_finder(path: Path, frames: Sequence[Frame], options: BagOptions) -> M
     bag = Bag(path)
     lidar = read_message(frames[0].cloud_path)[1].header.frame_id.lstrip("/")
     poses = _odometry if options.motion == "odometry" else _moving_transforms
-    return partial(_by_poses, _Trajectory.of(path, poses(bag, lidar, options)))
+    return partial(motion_by_poses, Trajectory.of(path, poses(bag, lidar, options)))
 
 
 @dataclass(frozen=True, eq=False)
-class _Trajectory:
+class Trajectory:
     """Poses of the LiDAR in a fixed frame: (n,) stamps [s] after the first [ns], and (n, 4, 4)."""
 
     path: Path
@@ -72,7 +73,7 @@ class _Trajectory:
     T_world_lidar: Array
 
     @staticmethod
-    def of(path: Path, poses: Iterator[tuple[int, Array]]) -> _Trajectory:
+    def of(path: Path, poses: Iterator[tuple[int, Array]]) -> Trajectory:
         """Of stamps [ns] and poses in any order; of several with one stamp, the last."""
         by_stamp = dict(sorted(dict(poses).items()))
         if len(by_stamp) < 2:  # noqa: PLR2004
@@ -80,7 +81,7 @@ class _Trajectory:
                                "those of the drive, or --motion scans")  # fmt: skip
         start_ns = next(iter(by_stamp))
         stamps = np.array([stamp - start_ns for stamp in by_stamp], np.float64) / 1e9
-        return _Trajectory(path, start_ns, stamps, np.array(list(by_stamp.values())))
+        return Trajectory(path, start_ns, stamps, np.array(list(by_stamp.values())))
 
     def at(self, stamp_s: float) -> Array:
         """(4, 4) between the poses before and after."""
@@ -99,7 +100,8 @@ class _Trajectory:
         return transform(turn(np.clip(share, 0, 1)), shift)
 
 
-def _by_poses(trajectory: _Trajectory, frame: Frame, to_s: float) -> ScanMotion:
+def motion_by_poses(trajectory: Trajectory, frame: Frame, to_s: float) -> ScanMotion:
+    """The motion of a frame's scan, from poses about its stamp."""
     stamp_s = ((frame.stamp_ns or 0) - trajectory.start_ns) / 1e9
     before, after = (trajectory.at(stamp_s + to_s / 2 + t) for t in (-_HALF_S, _HALF_S))
     twist = twist_between(before, after, 2 * _HALF_S)
@@ -196,11 +198,6 @@ def frames_of_bag(
     Of several LiDARs, the base first, its clouds are paired with those of the others, too. The
     first frame has the index ``start``; names are stamps behind the prefix.
     """
-    if lidars and options.motion != "none":
-        raise DatasetError(
-            f"{path}: clouds of several LiDARs are not corrected for motion; leave --motion out, "
-            "and choose frames in which the vehicle stands"
-        )
     bag = Bag(path)
     topics = choose_topics(bag, options.topics, [*cameras], lidars=lidars)
     images = topics.paired
@@ -228,10 +225,8 @@ def frames_of_bag(
         for row, cell in zip(complete, cells, strict=True)
     )
     if options.motion != "none":
-        apart_ns = [
-            after_ns(clouds, stamps[images[n]], rows, complete) for n, rows in pairs.items()
-        ]
-        to_s = np.median(apart_ns, axis=0) / _S
+        apart_ns = [after_ns(clouds, stamps[images[n]], pairs[n], complete) for n in cameras]
+        to_s = np.median(apart_ns, axis=0) / _S if apart_ns else np.zeros(len(complete))
         find = motion_finder(path, recorded, options)
         recorded = tuple(
             replace(frame, find_motion=cache(partial(find, frame, float(s))))

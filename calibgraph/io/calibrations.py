@@ -1,19 +1,19 @@
 """Results from disk: the YAML file of a calibration, and the table beside it."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, BeforeValidator, StrictBool
+from pydantic import AfterValidator, AliasPath, BaseModel, BeforeValidator, Field, StrictBool
 
 from calibgraph.arrays import Array
 from calibgraph.errors import FileError
 from calibgraph.files import checked_model, holds_truth_value, load_model, read_yaml, sha256
 from calibgraph.io.tables import load_camera_matches, load_correspondences
 from calibgraph.model.calibration import Calibration, Residuals
-from calibgraph.model.config import FORMER_SETTINGS, Config, Terms
+from calibgraph.model.config import FORMER_SETTINGS, Config, Reported, Terms
 from calibgraph.model.error_sources import ErrorSources
 from calibgraph.model.lens import LensEstimate, joint_parameters
 from calibgraph.model.result_files import (
@@ -264,41 +264,33 @@ def is_calibration(content: Mapping[str, Any]) -> bool:
     return content.get("format") == CALIBRATION_FORMAT
 
 
-class _Sources(BaseModel):
-    """The keys of a result's file that hold hashes of what it was made from."""
+class StatedResult(BaseModel):
+    """Keys of a result's file that are read without the rest of it."""
 
     inputs: dict[str, str] = {}
     correspondences_sha256: str | None = None
-
-
-def is_made_from(path: Path, hashes: Iterable[str]) -> bool:
-    """Whether a rig's file is a result that was made from a source of one of these SHA-256."""
-    if not is_calibration_file(path):
-        return False
-    sources = load_model(_Sources, path)
-    return not {sources.correspondences_sha256, *sources.inputs.values()}.isdisjoint(hashes)
-
-
-class _ErrorBars(BaseModel):
-    """The keys of a result's file that hold its error bars."""
-
     covariance: dict[str, Covariance | None] = {}
     error_bar_holds: dict[str, StrictBool] = {}
+    status: Status | None = Field(None, validation_alias=AliasPath("verdict", "status"))
+    of: Reported = Field("alignment", validation_alias=AliasPath("config", "of"))
+
+    @property
+    def hashes(self) -> set[str | None]:
+        """SHA-256 of all that it was made from."""
+        return {self.correspondences_sha256, *self.inputs.values()}
+
+    @property
+    def error_bars(self) -> dict[str, Array | None]:
+        """Per camera, its (6, 6) covariance; None for one that does not hold."""
+        return {
+            name: covariance if self.error_bar_holds.get(name) else None
+            for name, covariance in self.covariance.items()
+        }
 
 
-def error_bars(path: Path) -> dict[str, Array | None] | None:
-    """Per camera of a result, its (6, 6) covariance; None for one that does not hold.
-
-    Returns:
-        None if the file is no result.
-    """
-    if not is_calibration_file(path):
-        return None
-    found = load_model(_ErrorBars, path)
-    return {
-        name: covariance if found.error_bar_holds.get(name) else None
-        for name, covariance in found.covariance.items()
-    }
+def stated_result(path: Path) -> StatedResult | None:
+    """What the file of a rig states if it is a result; None if it is none."""
+    return load_model(StatedResult, path) if is_calibration_file(path) else None
 
 
 def _require_whole(content: Mapping[str, Any], path: Path) -> None:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.errors import CorrespondenceError, FileError
-from calibgraph.files import require_file, wide_encoding
+from calibgraph.files import require_file
 from calibgraph.model.camera_matches import COLUMNS, FORMAT, NAMES, NUMBERS, PLANES, CameraMatches
 from calibgraph.model.correspondences import (
     COORDINATES,
@@ -69,11 +69,9 @@ def read_arrow(
 
 
 def _require_commas(path: Path) -> None:
-    """Check the encoding of a CSV file, and what separates the columns of its first line."""
+    """Check what separates the columns of a CSV file, by its first line."""
     with path.open("rb") as file:
         head = file.readline(2**16)
-    if encoding := wide_encoding(head):
-        raise FileError(path, f"is {encoding}; save it as UTF-8 (in Excel: CSV UTF-8)")
     for separator, name in ((b";", "semicolons"), (b"\t", "tabs")):
         if separator in head and b"," not in head:
             raise FileError(

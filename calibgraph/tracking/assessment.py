@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from calibgraph.arrays import Array, Mask
-from calibgraph.model.calibration import Calibration, Residuals
+from calibgraph.model.calibration import Calibration
 from calibgraph.model.config import Config
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import invert_each, pair_covariances, pose_rows
@@ -19,10 +19,10 @@ from calibgraph.model.summary import summarize
 from calibgraph.model.verdict import START, Check, Status, Verdict
 from calibgraph.report.as_json import finite
 from calibgraph.solver.error_model import Conflict
+from calibgraph.solver.matches import BlockResiduals
 from calibgraph.tracking.estimate import Estimate
 from calibgraph.tracking.events import Event
 from calibgraph.tracking.frames import StreamFrame
-from calibgraph.tracking.noise import median
 from calibgraph.tracking.state import COUNTS, State
 from calibgraph.tracking.sums import Numbers, Sums
 from calibgraph.trust.evidence import Estimate as Checked
@@ -135,18 +135,6 @@ def _recent_checks(state: _Judged, camera: int) -> list[Check]:
     return checks
 
 
-def recent_residuals(state: State, camera: int) -> Residuals:
-    """Residuals of the recent frames."""
-    scale = state.scales[camera]
-    return Residuals(
-        median_px=median(state.known_recent(camera)[:, 1]),
-        inlier_share=float(state.share[camera]),
-        sigma_px=scale.sigma_px,
-        loss_scale_px=scale.loss_scale,
-        gate_px=scale.gate_px,
-    )
-
-
 def covariance_by_camera(estimate: Estimate, names: tuple[str, ...]) -> dict[str, Array | None]:
     """Per camera (6, 6); None with too few frames."""
     known = ~np.isnan(np.diagonal(estimate.covariance)[::6])
@@ -184,7 +172,11 @@ def to_calibration(state: State, estimate: Estimate) -> Calibration:
         joint_covariance=known,
         pair_covariance=pair_covariances(mounts, rig.T_camera_lidar),
         camera_verdicts=dict(Verdicts(state, estimate)),
-        residuals={n: recent_residuals(state, c) for c, n in cameras if state.started[c]},
+        residuals={
+            name: BlockResiduals.at(state.references[camera], own[0]).summary(state.scales[camera])
+            for camera, name in cameras
+            if (own := state.matches_of(camera)) is not None
+        },
         counts={name: _counts(state, camera) for camera, name in cameras},
         timings_s={},
         terms="full",

@@ -6,7 +6,7 @@ import gc
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -27,12 +27,11 @@ from calibgraph.tracking.assessment import Update, json_lines
 from calibgraph.tracking.dataset_frames import DatasetDrive
 from calibgraph.tracking.durable import DurableCalibrator
 from calibgraph.tracking.frames import Item, frames_of
-from calibgraph.tracking.history import History
 from calibgraph.tracking.tracker import UNSOLVABLE, IncrementalCalibrator, warm_up_tracker
 
 Notify = Callable[[str], None]
 
-STATE_FOLDER, PICTURE = "state", "track.png"
+STATE_FOLDER = "state"
 _TOGETHER = 50  # frames of a table that are taken in by one write
 
 
@@ -43,7 +42,7 @@ class Tracking:
     Attributes:
         rig: the initial guess.
         config: settings.
-        out: folder for the state, the result and the picture.
+        out: folder for the state and the result.
         every: of datasets, match every so-many-th frame.
         matcher: for the frames of datasets; None for tables.
         interval_s: between neighbouring clouds of folders, whose registration shows the motion.
@@ -91,11 +90,7 @@ def track(
                 raise FileError("standard input" if waits else source[0], held)
             result = _result(calibrator.tracker, settings)
     run.report_counts()
-    written = [result.save(settings.out)]
-    if run.updates:
-        run.history.draw(settings.out / PICTURE)
-        written.append(settings.out / PICTURE)
-    return result, written
+    return result, [result.save(settings.out)]
 
 
 @dataclass
@@ -108,7 +103,6 @@ class Run:
         updates: frames taken in.
         left_out: input that was not a frame, or a frame that was left out.
         skipped: frames at the beginning that an earlier run had taken in already.
-        history: of the estimates.
     """
 
     calibrator: DurableCalibrator
@@ -116,7 +110,6 @@ class Run:
     updates: int = 0
     left_out: int = 0
     skipped: int = 0
-    history: History = field(default_factory=History)
 
     def follow(self, items: Iterator[Item], together: int, stop: Stop) -> None:
         """Update with each frame until there are no more, or a signal has come.
@@ -166,7 +159,6 @@ class Run:
 
     def _report(self, updates: Sequence[Update]) -> None:
         for update, line in zip(updates, json_lines(updates), strict=True):
-            self.history.add(update)
             print_line(line)
             for event in update.events:
                 self.notify(f"frame {event.detected_frame}: {event}")

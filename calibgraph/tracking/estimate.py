@@ -7,7 +7,7 @@ update eliminates the places of the open epoch and exchanges one factor of that 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
@@ -97,6 +97,7 @@ class Terms:
 
     Attributes:
         names: of the places.
+        known: (P,) their rows among the places whose optimum is known, -1 of new ones.
         seen: (P, n) which cameras have matches there.
         root: (P, n, 6, 6) Cholesky roots of the Hessians by weights.
         least: (n,) k of ``calibgraph.solver.within_place``.
@@ -107,6 +108,7 @@ class Terms:
     """
 
     names: tuple[str, ...]
+    known: Numbers
     seen: Mask
     root: Array
     least: Array
@@ -116,31 +118,27 @@ class Terms:
     robust_scale: float
 
     @staticmethod
-    def of(state: State, sums: PlaceSums, rows: Numbers, spread: Spread) -> Terms:
-        """Of some rows of the sums over all frames.
-
-        Args:
-            state: of the tracker.
-            sums: over all frames.
-            rows: of the places.
-            spread: of the frames.
-        """
-        own, frames, findings = sums.rows[rows], sums.frames[rows], state.findings
-        seen, places, prior = frames > 0, sums.places[rows], error_components()
+    def of(state: State, sums: PlaceSums, rows: Sequence[int], spread: Spread) -> Terms:
+        """Of some rows of the sums over all frames."""
+        own, findings, prior = sums.rows[rows], state.findings, error_components()
+        frames, places, settled = own.frames, sums.places[rows], state.settled
         names, weighted = tuple(sums.names[row] for row in rows), own.reweighted + WEAK
+        row_of = dict(zip(settled, range(len(settled)), strict=True))
+        known = np.array([row_of.get(name, -1) for name in names], dtype=np.int64)
         stated = findings.place_variance * spread.efficiency
         excess = spread.excess + (stated * frames / places)[..., None, None] * np.eye(6)
+        seen = frames > 0
         alike = np.where(seen, places, np.inf).min(axis=1)
         sizes = findings.place_rotation_rad, findings.place_translation_m
-        cloud = _cloud_information(*sizes, state.ratios.cloud)
         return Terms(
             names,
+            known,
             seen,
-            np.asarray(np.linalg.cholesky(weighted)),
+            np.linalg.cholesky(weighted),
             spread.least,
             state.ratios.cameras * excess,
-            _minimum(state, own, names, weighted),
-            alike[:, None, None] * cloud,
+            _minimum(state, own, known, weighted),
+            alike[:, None, None] * _cloud_information(*sizes, state.ratios.cloud),
             prior.robust_sigmas if sums.count >= prior.robust_places else np.inf,
         )
 
@@ -159,39 +157,33 @@ class Terms:
         exact = _ROUNDING**2 * np.eye(6)
         return np.asarray(inverse.swapaxes(2, 3) @ self.excess @ inverse + exact)
 
-    def weighted_at_place(self, weights: Array) -> Array:
-        """The same, for (P, 1 + n) weights in the loss."""
-        return np.asarray(self.at_place / weights[:, 1:, None, None])
+    def apart(self, found: Eliminated, shown: Array, weights: Array) -> tuple[Array, Array]:
+        """Displacements of the clouds, (P, 6), and of the cameras, (P, n, 6)."""
+        return found.displacements(shown, self.at_place / weights[:, 1:, None, None])
 
     def squared(self, u: Array, v: Array) -> Array:
-        """(P, 1 + n) squared sigmas of the displacements of the clouds and of the cameras."""
+        """(P, 1 + n) squared sigmas of such displacements, in a loss that is not robust."""
         of_u = (u * (self.cloud @ u[..., None])[..., 0]).sum(axis=-1)
         of_v = (v * np.linalg.solve(self.at_place, v[..., None])[..., 0]).sum(axis=-1)
         return np.column_stack([of_u, np.where(self.seen, of_v, 0.0)])
 
-    def weigh(self, squared: Array) -> Array:
-        """(P, 1 + n) weights in the loss of Geman and McClure."""
-        return np.asarray((1.0 + squared / self.robust_scale**2) ** -2)
+    def weigh(self, u: Array, v: Array) -> Array:
+        """(P, 1 + n) weights of such displacements in the loss of Geman and McClure."""
+        return np.asarray((1.0 + self.squared(u, v) / self.robust_scale**2) ** -2)
 
-    def known_weights(self, state: State) -> tuple[Array, Mask]:
-        """(P, 1 + n) weights at the optimum of the last epoch, 1 of new places; which are new."""
-        weights = np.ones((len(self.names), 1 + self.seen.shape[1]))
-        row_of = {name: row for row, name in enumerate(state.settled)}
-        rows = [row_of.get(name, -1) for name in self.names]
-        new = np.array(rows, dtype=np.int64) < 0
-        if np.isfinite(self.robust_scale) and not new.all():
-            weights[~new] = state.weights[[row for row in rows if row >= 0]]
-        return weights, new
+    def known_weights(self, state: State) -> Array:
+        """(P, 1 + n) weights at the optimum of the last epoch, 1 of new places."""
+        weights, known = np.ones((len(self.names), 1 + self.seen.shape[1])), self.known >= 0
+        if np.isfinite(self.robust_scale) and known.any():
+            weights[known] = state.weights[self.known[known]]
+        return weights
 
     def open_weights(self, state: State, adjoint: Array) -> Array:
-        """(P, 1 + n) weights while an epoch is open: of new places, from a non-robust start."""
-        if not np.isfinite(self.robust_scale):
-            return np.ones((len(self.names), 1 + self.seen.shape[1]))
-        weights, new = self.known_weights(state)
-        for _ in range(_OPEN_WEIGHINGS if new.any() else 0):
-            found, at_place = self.eliminate(weights, adjoint), self.weighted_at_place(weights)
-            apart = found.displacements(state.shared, at_place)
-            weights[new] = self.weigh(self.squared(*apart))[new]
+        """The same while an epoch is open: of new places, from a non-robust start."""
+        weights, new = self.known_weights(state), self.known < 0
+        for _ in range(_OPEN_WEIGHINGS if np.isfinite(self.robust_scale) and new.any() else 0):
+            found = self.eliminate(weights, adjoint)
+            weights[new] = self.weigh(*self.apart(found, state.shared, weights))[new]
         return weights
 
 
@@ -201,19 +193,17 @@ def _cloud_information(rotation_rad: float, translation_m: float, ratio: float) 
     return np.asarray(np.linalg.inv(ratio * pose_covariance(rotation_rad**2, translation_m**2)))
 
 
-def _minimum(state: State, own: Sums, names: tuple[str, ...], weighted: Array) -> Array:
+def _minimum(state: State, own: Sums, known: Numbers, weighted: Array) -> Array:
     """(P, n, 6) from the references to the minima of quadratics with the Hessian by weights.
 
     The gradient is that of the robust cost, by its true Hessian, where matches of the place show
     the cameras at the optimum of the last epoch; of a new place, at its own minimum.
     """
-    row_of = {name: row for row, name in enumerate(state.settled)}
-    known = np.array([name in row_of for name in names], dtype=np.bool_)
-    at = np.zeros_like(own.gradient)
-    if known.any():
-        at[known] = state.steps[[row_of[name] for name in names if name in row_of]]
+    if (known < 0).all():
+        return np.asarray(-np.linalg.solve(own.hessian + WEAK, own.gradient[..., None])[..., 0])
+    at = np.where((known >= 0)[:, None, None], state.steps[known], 0.0)
     pull = own.gradient + (own.hessian @ at[..., None])[..., 0]
-    by = np.where(known[:, None, None, None], weighted, own.hessian + WEAK)
+    by = np.where((known >= 0)[:, None, None, None], weighted, own.hessian + WEAK)
     return np.asarray(at - np.linalg.solve(by, pull[..., None])[..., 0])
 
 
@@ -313,7 +303,7 @@ class EpochGraph:
         found = np.flatnonzero(every.frames.any(axis=1)).tolist()
         rows = [row for row in found if every.names[row] in names]
         spread = self.open_spread(state, every)
-        return Terms.of(state, every, np.array(rows, dtype=np.int64), spread)
+        return Terms.of(state, every, rows, spread)
 
     def open_spread(self, state: State, every: PlaceSums) -> Spread:
         """That of all frames; of many, the open epoch hardly changes it."""
@@ -327,9 +317,8 @@ class EpochGraph:
         size = 6 * len(state.names)
         if not rows:
             return np.zeros((size, size)), np.zeros(size)
-        terms = Terms.of(state, self.places, np.array(rows), self.spread)
-        weights, _ = terms.known_weights(state)
-        found = terms.eliminate(weights, self.window.adjoint)
+        terms = Terms.of(state, self.places, rows, self.spread)
+        found = terms.eliminate(terms.known_weights(state), self.window.adjoint)
         return found.information, found.vector
 
     def at_its_place(self, state: State) -> tuple[Array, Array]:
@@ -342,7 +331,7 @@ class EpochGraph:
         row, shown = own.names.index(state.at[-1]), self.window.shown
         weights = own.open_weights(state, self.window.adjoint)
         found = own.eliminate(weights, self.window.adjoint)
-        u, v = found.displacements(shown, own.weighted_at_place(weights))
+        u, v = own.apart(found, shown, weights)
         steps = shown + v[row] - (self.window.adjoint @ u[row])
         return own.squared(u, v)[row], retract_all(state.references, steps)
 
@@ -462,7 +451,7 @@ def settle(state: State) -> EpochGraph:
     """Find optimum, weights and variance ratios of the closed epochs; the graph with these."""
     state.spread = spread_of(state, closed_places(state))
     graph = EpochGraph(state)
-    rows = np.flatnonzero(graph.places.frames.any(axis=1))
+    rows = np.flatnonzero(graph.places.frames.any(axis=1)).tolist()
     shows_ratios = len(rows) > 1 or bool(len(rows) and state.rig.relative_poses)
     for left in range(_ROUNDS if shows_ratios else 0, -1, -1):
         terms = Terms.of(state, graph.places, rows, graph.spread)
@@ -482,7 +471,7 @@ def settle(state: State) -> EpochGraph:
 def locate_places(state: State, graph: EpochGraph) -> None:
     """Find the optimum of all places, those of the open epoch too, for the present ratios."""
     every = every_place(state, graph.places, state.all_sums())
-    rows = np.flatnonzero(every.frames.any(axis=1))
+    rows = np.flatnonzero(every.frames.any(axis=1)).tolist()
     if len(rows) > 1:
         _fit(state, Terms.of(state, every, rows, graph.spread), graph.window)
 
@@ -492,13 +481,13 @@ def _fit(state: State, terms: Terms, window: Window) -> Eliminated:
 
     In a robust loss those of new places start from 1. The places are left eliminated.
     """
-    weights, _ = terms.known_weights(state)
+    weights = terms.known_weights(state)
     for _ in range(_MOST_WEIGHINGS):
         found = terms.eliminate(weights, window.adjoint)
         window.exchange(found.information, found.vector)
         shown = window.shown
-        u, v = found.displacements(shown, terms.weighted_at_place(weights))
-        new = terms.weigh(terms.squared(u, v))  # 1 in a loss that is not robust
+        u, v = terms.apart(found, shown, weights)
+        new = terms.weigh(u, v)  # 1 in a loss that is not robust
         if not new.size or np.abs(new - weights).max() < _SAME_WEIGHT:
             break
         weights = new
@@ -511,7 +500,7 @@ def _evidence(
     state: State, terms: Terms, found: Eliminated, window: Window
 ) -> dict[Component, Evidence]:
     """Per component its weighted sum of squares, and what of its freedom the data determine."""
-    weights, at_place = state.weights, terms.weighted_at_place(state.weights)
+    weights, at_place = state.weights, terms.at_place / state.weights[:, 1:, None, None]
     squared = weights * terms.squared(*found.displacements(state.shared, at_place))
     of_u, of_v = found.covariances(window.covariance_of_shown, at_place)
     open_u = np.trace(terms.cloud @ of_u, axis1=1, axis2=2) * weights[:, 0]

@@ -86,8 +86,6 @@ CSV: dict[str, bytes] = {
     + b"left,1,1,2,3,4,5\n",
     "separated by semicolons": b"camera;frame\na;0\n",
     "separated by tabs": b"camera\tframe\na\t0\n",
-    "is UTF-16": "camera,frame\na,0\n".encode("utf-16"),
-    "is UTF-16, without a mark": "camera,frame\na,0\n".encode("utf-16-le"),
 }
 MATCHES = camera_matches().to_arrow()
 CAMERA_MATCHES: dict[str, pa.Table] = {

@@ -33,11 +33,6 @@ def data() -> Dataset:
 
 
 @pytest.fixture(scope="module")
-def truth() -> Rig:
-    return calibgraph.load_rig(SAMPLE / "reference.yaml")
-
-
-@pytest.fixture(scope="module")
 def found(data: Dataset, truth: Rig) -> CameraMatches:
     return match_cameras(data, truth)
 

@@ -24,7 +24,7 @@ from calibgraph.tracking import command
 from calibgraph.tracking.command import Tracking, track
 from tests.tracking.drives import FRAMES, Crashed, World
 
-pytestmark = pytest.mark.usefixtures("no_picture")
+pytestmark = pytest.mark.usefixtures("not_warmed_up")
 
 
 @dataclass

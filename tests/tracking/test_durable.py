@@ -33,7 +33,7 @@ from calibgraph.tracking.frames import StreamFrame
 from tests.conftest import KANNALA, Call
 from tests.tracking.drives import World, drive_at, moved, pair_of, step_of
 
-pytestmark = pytest.mark.usefixtures("no_picture")
+pytestmark = pytest.mark.usefixtures("not_warmed_up")
 
 
 def test_a_refused_update_changes_neither_the_tracker_nor_the_disk(

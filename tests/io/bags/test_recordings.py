@@ -191,9 +191,10 @@ def test_bags_and_folders_form_one_problem(tmp_path: Path) -> None:
     [("ros1", "BZ2"), ("ros1", "LZ4"), ("sqlite3", "MESSAGE"), ("mcap", "STORAGE")],
 )
 def test_compressed_bags_hold_the_same(tmp_path: Path, kind: str, compression: str) -> None:
-    messages = sample_messages(Messages(kind))
+    two = load_dataset(SAMPLE, frames="0:2")
+    messages = sample_messages(Messages(kind), two)
     data = load_dataset(write_bag(tmp_path, kind, messages, compression=compression))
-    require_same_frames(data.select("::5"), load_dataset(SAMPLE).select("::5"))
+    require_same_frames(data, two)
 
 
 @pytest.mark.parametrize("kind", ["sqlite3", "mcap"])

@@ -166,12 +166,6 @@ def test_opencv_writes_the_same_in_two_languages(
     assert rig.cameras["front"].distortion == RADTAN5
 
 
-def test_a_matrix_of_numpy_is_read_in_the_direction_of_its_name(tmp_path: Path) -> None:
-    np.save(tmp_path / "lidar_to_cam.npy", FRONT)
-    files = [*saved({"front.yaml": TEXTS["lens"]}, tmp_path), tmp_path / "lidar_to_cam.npy"]
-    np.testing.assert_array_equal(import_rig(files).T_camera_lidar["front"], FRONT)
-
-
 def test_one_frame_serves_all_cameras_of_a_chain(tmp_path: Path) -> None:
     chain = TEXTS["camchain"].replace("T_cam_lidar", "T_cam_imu")
     files = saved({"chain.yaml": chain, "car.urdf": TEXTS["urdf"]}, tmp_path)
