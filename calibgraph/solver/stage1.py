@@ -35,7 +35,7 @@ COMMON_SAMPLE = 1000
 """Matches of all frames, for a pose that single frames start from."""
 
 _MEDOID_OF = 500  # rotations at most: it is a start of the median, and its cost is quadratic
-_STEPS, _LEAST_RAD = 50, 1e-6  # of the median: far below any rotation that matters
+_STEPS, _LEAST_RAD = 50, 1e-5  # of the median: far below any rotation that matters
 _ALIKE_RAD, _ALIKE_M = np.radians(0.05), 0.01  # frames that differ by less all count
 
 
