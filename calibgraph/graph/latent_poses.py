@@ -125,7 +125,7 @@ class LatentPoseModel:
         """Numbers of the cameras that have correspondences."""
         return [number for number, name in enumerate(self.cameras) if name in self.blocks]
 
-    @property
+    @cached_property
     def paired(self) -> list[int]:
         """Numbers of the cameras that are part of a pair."""
         names = {name for pair in self.pairs for name in (pair.a, pair.b)}

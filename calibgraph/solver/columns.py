@@ -114,7 +114,7 @@ class ColumnFit:
         values = (inverse @ (self.hessian @ self.values)[rows, None])[:, :, 0]
         frames, pulls = len(self.gradients), self.gradients.T[rows]
         shown = pulls @ pulls.transpose(0, 2, 1)
-        scatter = with_pseudo_frames(shown, own, np.full(size, float(frames)))
+        scatter = with_pseudo_frames(shown, own, float(frames))
         scatter += _nearly_free(size) if frames > 1 else np.nan
         follow = inverse @ self.hessian[rows, len(self.hessian) - self.considered :]
         whole = inverse @ scatter @ inverse + self.shared * inverse

@@ -17,7 +17,7 @@ from calibgraph.model.calibration import Residuals
 from calibgraph.model.clock import at_pixels, motion_of
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
-from calibgraph.model.geometry import to_T_lidar_camera
+from calibgraph.model.geometry import to_T_camera_lidar, to_T_lidar_camera
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.solver.preprocess import hash_numbers
 from calibgraph.solver.robust import (
@@ -287,7 +287,8 @@ class BlockResiduals:
         root = np.column_stack([across, np.zeros(len(across))])
         weighted = replace(edge, block=edge.block.rewhiten(root))
         of_run = np.searchsorted(band, edges)
-        sums = weighted.with_scale(scale).frame_sums(self.T_lidar_camera, of_run)
+        T = to_T_camera_lidar(self.T_lidar_camera)[None]
+        sums = weighted.with_scale(scale).summarize(T, to_runs(of_run))
         return np.asarray(-sums.hessian / (2 * _GATE_BAND))
 
     def summary(self, scale: ResidualScale) -> Residuals:
