@@ -120,10 +120,9 @@ def _from_common_pose(
     for start_of in (pose_near_guess, ransac_pnp):
         if found.all() or (start := start_of(camera, sample, config)) is None:
             break
-        near = fit_frames(wide, runs, np.tile(start, (len(runs), 1, 1)), tolerance=COARSE)
-        refined = refine_frames(block, runs, near.T_camera_lidar, config)
-        majority = refined.inliers - 3 > (runs[:, 1] - runs[:, 0]) / 2
-        poses, found = refined.T_camera_lidar, refined.found & majority
+        near, *_ = fit_frames(wide, runs, np.tile(start, (len(runs), 1, 1)), tolerance=COARSE)
+        poses, found, inliers = refine_frames(block, runs, near, config)
+        found &= inliers - 3 > (runs[:, 1] - runs[:, 0]) / 2
     return poses, found
 
 
