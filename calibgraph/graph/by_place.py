@@ -78,11 +78,10 @@ class BlockByPlace:
             return self.block.run_sums(T, runs)
         return self.block.summarize(T, runs, self.free, values)
 
-    def factors(self, place: int, keys: Sequence[int]) -> list[gtsam.NonlinearFactor]:
+    def factor(self, place: int, keys: Sequence[int]) -> gtsam.NonlinearFactor:
         """The correspondences of one place, lossless, on cloud, camera and columns there."""
-        first, end = self.edges[place : place + 2].tolist()
-        block = self.block.select(np.arange(first, end))
-        return [placed_factor(keys, block, self.free)] if first < end else []
+        rows = np.arange(*self.edges[place : place + 2])
+        return placed_factor(keys, self.block.select(rows), self.free)
 
 
 @dataclass(frozen=True, eq=False)

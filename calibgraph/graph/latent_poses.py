@@ -33,7 +33,7 @@ from calibgraph.graph.by_place import (
     BlockByPlace,
     PairByPlace,
 )
-from calibgraph.graph.components import EXACT, VarianceComponents, shown_distortion
+from calibgraph.graph.components import EXACT, VarianceComponents
 from calibgraph.graph.lens import LensTerm, lens_graph
 from calibgraph.graph.objective import join
 from calibgraph.graph.variables import (
@@ -53,7 +53,6 @@ from calibgraph.model.config import Reported
 from factors import (
     displaced_between_factor,
     placed_factor,
-    robust_noise,
     to_runs,
 )
 
@@ -280,8 +279,7 @@ def data_graph(model: LatentPoseModel) -> gtsam.NonlinearFactorGraph:
     graph = gtsam.NonlinearFactorGraph()
     for place, camera in model.matched_places:
         keys = [cloud_at_key(place), matched_at_key(place, camera), *model.lens_keys(camera)]
-        for factor in model.blocks[model.cameras[camera]].factors(place, keys):
-            graph.add(factor)
+        graph.add(model.blocks[model.cameras[camera]].factor(place, keys))
     for pair in model.pairs:
         key_a, key_b = (paired_key(model.cameras.index(name)) for name in (pair.a, pair.b))
         for place, (first, end) in zip(pair.places.tolist(), to_runs(pair.edges), strict=True):
@@ -310,10 +308,9 @@ def _distortion_graph(parts: VarianceComponents) -> gtsam.NonlinearFactorGraph:
     graph, size = gtsam.NonlinearFactorGraph(), parts.distortion_jacobian.shape[2]
     noise = gtsam.noiseModel.Diagonal.Variances(np.broadcast_to(parts.distortion_size, size))
     graph.add(gtsam.PriorFactorVector(DISTORTION, np.zeros(size), noise))
-    information, vector, constant = shown_distortion(parts)
-    zero = gtsam.Values()
+    zero, quadratic = gtsam.Values(), (parts.distortion_information, parts.distortion_vector)
     zero.insert(DISTORTION, np.zeros(size))
-    shown = gtsam.HessianFactor(DISTORTION, information, vector, constant)
+    shown = gtsam.HessianFactor(DISTORTION, *quadratic, 0.0)
     graph.add(gtsam.LinearContainerFactor(shown, zero))
     return graph
 
@@ -324,4 +321,5 @@ def _noise(covariance: Array) -> gtsam.noiseModel.Gaussian:
 
 def _robust(covariance: Array, scale: float) -> gtsam.noiseModel.Base:
     noise = _noise(covariance)
-    return noise if np.isinf(scale) else robust_noise(noise, loss="geman_mcclure", scale=scale)
+    loss = gtsam.noiseModel.mEstimator.GemanMcClure.Create(scale)
+    return noise if np.isinf(scale) else gtsam.noiseModel.Robust.Create(loss, noise)

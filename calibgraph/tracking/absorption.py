@@ -314,8 +314,7 @@ def _bends_of(state: State, camera: int, matches: CameraBlock) -> Array:
         at.setdefault(state.at[row], []).append(number)
     places = [np.array(of_place, dtype=np.int64) for of_place in at.values()]
     pose = to_T_lidar_camera(state.references[camera])
-    evidence = distortion_evidence(matches, state.scales[camera], pose, WEAK, places=places)
-    one = evidence.as_of_one_place()
+    one = distortion_evidence(matches, state.scales[camera], pose, WEAK, places=places)
     parts = one.hessian, one.hessian @ one.jacobian, one.information, one.vector
     return np.concatenate([part.ravel() for part in parts])
 

@@ -370,15 +370,13 @@ class EpochGraph:
         findings, bends, n = state.findings, state.bends, len(state.names)
         sigmas, shared = np.asarray(findings.bend_sigmas), state.ratios.shared
         size = len(sigmas)
-        jacobian, shown = np.zeros((n, 6, size)), np.zeros((1, n, size, size))
-        vector = np.zeros((1, n, size))
+        jacobian, shown, vector = np.zeros((n, 6, size)), np.zeros((size, size)), np.zeros(size)
         if any(findings.bend_sigmas):
             hessian, pulled = bends[:, :36].reshape(-1, 6, 6), bends[:, 36:54].reshape(-1, 6, size)
             jacobian = np.linalg.solve(hessian + WEAK, pulled) * sigmas
             weight = 1.0 / spread.mean_variance(findings.place_variance, sums.alike)
-            shown[0] = weight[:, None, None] * bends[:, 54:63].reshape(-1, size, size)
-            shown[0] *= np.outer(sigmas, sigmas)
-            vector[0] = weight[:, None] * bends[:, 63:] * sigmas
+            shown = np.outer(sigmas, sigmas) * (weight @ bends[:, 54:63]).reshape(size, size)
+            vector = sigmas * (weight @ bends[:, 63:])
         each = np.tile(np.eye(6), (1, n, 1, 1))
         components = VarianceComponents(
             cloud=np.eye(6),
@@ -391,7 +389,6 @@ class EpochGraph:
             pair_distortion_jacobian=np.zeros_like(jacobian),
             distortion_information=shown,
             distortion_vector=vector,
-            distortion_weight=np.ones((1, n)),
         )
         prior = common_error(components, findings.rigid_sigmas, findings.camera_share)
         components = VarianceRatios(shared=shared).scale(prior)

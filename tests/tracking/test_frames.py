@@ -142,7 +142,7 @@ def test_a_wrong_line_is_refused_and_the_next_one_read(wrong: bytes, message: st
         (line() + b'{"frame": "' + b"x" * 1_000_000, "line 2: is longer than 100000 bytes"),
         (b"PAR1\x15\x04\0\0", "is not text; send a line of JSON per frame"),
         (b"\x89PNG\n", "is not UTF-8"),
-        (line().decode().encode("utf-16"), "is UTF-16, as PowerShell"),
+        (line().decode().encode("utf-16"), "is not a text file in UTF-8"),
     ],
 )
 def test_what_is_no_text_in_lines_ends_the_stream(
