@@ -29,7 +29,6 @@ _LAST_FRAMES = 20  # of which it is kept whether they agree with the estimate
 _ABSORBED = np.array([[name == one for one in ("given", "used", "absorbed")] for name in COUNTS])
 _UNUSUAL = 25.0  # squared sigmas of a six-vector
 _TOTAL_KEPT = 1 - 1 / 2000  # of the total scatter, from frame to frame
-_TRY_AGAIN = 1.5  # growth of the number of frames from attempt to attempt to start
 
 
 def begin_frames(state: State, frames: Sequence[StreamFrame]) -> None:
@@ -233,7 +232,7 @@ def _try_to_start(state: State, camera: int, table: Correspondences) -> None:
     waiting = (*state.waiting[camera], own)
     count, waiting = len(waiting), waiting[-HISTORY:]
     state.put(camera, waiting=waiting)
-    if not _is_attempt_due(count, state.config.tracking.start_frames):
+    if count % min(state.config.tracking.start_frames, HISTORY):
         return
     rig = Rig(lidar=state.rig.lidar, cameras={name: state.rig.cameras[name]})
     try:
@@ -245,12 +244,6 @@ def _try_to_start(state: State, camera: int, table: Correspondences) -> None:
         _wait_longer(state, camera, result.camera_verdicts[name].reasons)
         return
     _start_camera(state, camera, result.T_camera_lidar[name])
-
-
-def _is_attempt_due(frames: int, first: int) -> bool:
-    """At the first frames, then at growing intervals, then with every new window of frames."""
-    attempts = first * _TRY_AGAIN ** np.arange(10)
-    return frames in attempts.astype(int) or frames >= HISTORY
 
 
 def _wait_longer(state: State, camera: int, reasons: tuple[str, ...]) -> None:
