@@ -186,34 +186,20 @@ def decode_text(data: bytes, path: Path | str) -> str:
     """The text of a file.
 
     Raises:
-        FileError: if it is of another encoding, which is named, or no text.
+        FileError: if it is of another encoding, or no text.
     """
-    if encoding := wide_encoding(data):
-        raise FileError(
-            path, f"is {encoding}, as PowerShell and Notepad write it; save it as UTF-8"
-        )
     data = data.removeprefix(b"\xef\xbb\xbf")
     try:
         return io.StringIO(data.decode(), newline=None).read()
     except UnicodeDecodeError as error:
         if b"\0" in data:
-            raise FileError(path, f"is not a text file ({error.reason})") from error
+            raise FileError(path, f"is not a text file in UTF-8 ({error.reason})") from error
         line = data.count(b"\n", 0, error.start) + 1
         raise FileError(
             path,
             f"is not UTF-8: line {line} holds the byte 0x{data[error.start]:02x}, a letter "
             "of Latin-1 or Windows-1252, say; save it as UTF-8",
         ) from error
-
-
-def wide_encoding(data: bytes) -> str:
-    """UTF-16 or UTF-32, if a text is in them by its mark or its zero bytes; else empty."""
-    head = data[:64]
-    if head.startswith((b"\xff\xfe\0\0", b"\0\0\xfe\xff")):
-        return "UTF-32"
-    zeros = [head[start::2].count(0) * 2 >= len(head) - 1 for start in (0, 1)]
-    is_wide = len(head) > 1 and zeros[0] != zeros[1]
-    return "UTF-16" if is_wide or head.startswith((b"\xff\xfe", b"\xfe\xff")) else ""
 
 
 def write_yaml(path: Path, content: dict[str, Any], *, first_line: str = "") -> None:

@@ -47,11 +47,6 @@ from tests.matching.structure.data import with_noise_images
 
 
 @pytest.fixture(scope="module")
-def truth() -> Rig:
-    return calibgraph.load_rig(SAMPLE / "reference.yaml")
-
-
-@pytest.fixture(scope="module")
 def data(truth: Rig) -> Dataset:
     return calibgraph.load_dataset(SAMPLE, truth)
 
@@ -231,6 +226,7 @@ def test_a_camera_whose_matches_are_displaced_comes_back_to_its_neighbour(
     assert {"match_cameras", "solve_pairs"} <= tied.watch.seconds.keys()
 
 
+@pytest.mark.slow
 def test_cameras_are_matched_through_the_lenses_that_were_estimated(
     data: Dataset, truth: Rig
 ) -> None:
@@ -353,6 +349,8 @@ def late_sample() -> Dataset:
     return dataset_from_arrays(rig, clouds, {ONE: images}, twists_per_s=twists)
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_offset_and_readout_are_found_with_the_pose() -> None:
     data, rig = late_sample(), one_camera()
     start = perturb(rig, rotation_deg=1.0, translation_m=0.1, seed=0)

@@ -74,12 +74,14 @@ def evaluate(
 
     Of a reference with error bars, as `calibgraph pick` writes it, in standard deviations as well.
     """
-    from calibgraph.io.calibrations import error_bars
+    from calibgraph.io.calibrations import stated_result
     from calibgraph.io.rigs import load_rig, rig_file
     from calibgraph.model.metrics import evaluate
 
     path = rig_file(estimate)
-    errors = evaluate(load_rig(estimate), load_rig(reference), error_bars(path))
+    stated = stated_result(path)
+    bars = None if stated is None else stated.error_bars
+    errors = evaluate(load_rig(estimate), load_rig(reference), bars)
     if as_json:
         print_json(asdict(errors))
     else:
@@ -235,7 +237,7 @@ def export(
     from calibgraph.io.rigs import load_rig
     from calibgraph.model.plausibility import MAX_DISTANCE_M, find_implausible
 
-    with checked_arguments():
+    with checked_arguments(), progress_bar("writing"):
         T_base_lidar = None if lidar_pose is None else _parse_pose(lidar_pose)
         written = export_calibration(
             source, out, format, cameras=camera or None, lidar_frame=lidar_frame,

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from calibgraph.errors import FileError, in_words
+from calibgraph.errors import DatasetError, FileError, in_words
 from calibgraph.files import require_file
 from calibgraph.io.tables import read_feather
 from calibgraph.model.correspondences import MAX_COORDINATE
@@ -27,6 +27,11 @@ INTENSITIES = (
     "i",
 )  # fmt: skip
 """Names of an intensity in lower case, the first that is there counts."""
+
+TIMES = ("t", "time", "timestamp", "offset_time", "time_offset", "time_stamp")
+"""Names of a point's time: of Ouster, Velodyne, Hesai, Livox, and Autoware."""
+_STAMPS, _NANOSECOND_STAMPS = 1e6, 1e15  # times since a scan's start are smaller, since 1970 larger
+_LONGEST_S = 1.0
 
 _SCALAR = "scalar_"  # CloudCompare's prefix
 _MOST_DIGITS = 18  # of a number of 64 bits
@@ -40,11 +45,13 @@ class RawCloud(NamedTuple):
         points: (n, 4) x y z [m] and intensity, NaN where there is none.
         fields: their names in the file.
         told: in one line, what the content alone tells, where the file does not say it.
+        times: (n,) of the points, as the file has them; None if it has none.
     """
 
     points: NDArray[np.float32]
     fields: tuple[str, ...]
     told: str = ""
+    times: NDArray[Any] | None = None
 
 
 @dataclass(frozen=True)
@@ -94,7 +101,36 @@ def raw_cloud(
     columns = [column(name) for name in choose_fields(path, names)]
     if any(each.dtype.kind not in "fiu" for each in columns):
         raise FileError(path, "holds no numbers in the fields of its points")
-    return RawCloud(make_cloud(*columns), tuple(names))
+    times = [column(name) for name in time_fields(names)]
+    return RawCloud(make_cloud(*columns), tuple(names), times=times[0] if times else None)
+
+
+def time_fields(names: Iterable[str]) -> list[str]:
+    """The fields that give each point a time: such clouds are often as they were scanned."""
+    return [name for name in names if name in TIMES]
+
+
+def seconds_after(stamp_ns: int, times: NDArray[Any], where: str) -> NDArray[np.float64]:
+    """Times of points [s] after a stamp.
+
+    They are whole numbers of nanoseconds after it (Ouster, Livox), seconds after it (Velodyne), or
+    float64 stamps of their own, in seconds (Hesai, RoboSense) or nanoseconds.
+    """
+    if times.dtype.kind in "iu":
+        seconds = times.astype(np.float64) / 1e9
+    elif times.max(initial=0.0) > _NANOSECOND_STAMPS:
+        seconds = (times.astype(np.float64) - stamp_ns) / 1e9
+    elif times.max(initial=0.0) > _STAMPS:
+        seconds = times.astype(np.float64) - stamp_ns // 10**9 - stamp_ns % 10**9 / 1e9
+    else:
+        seconds = times.astype(np.float64)
+    if not np.all(np.abs(seconds) <= _LONGEST_S):  # not finite, too
+        raise DatasetError(
+            f"{where}: times from {np.min(seconds):.3g} to {np.max(seconds):.3g} s after the "
+            "stamp are not those of one scan; leave the motion out (--motion, poses.csv), or "
+            "record it again"
+        )
+    return seconds
 
 
 def make_cloud(
@@ -479,13 +515,12 @@ def read_cloud(path: Path, columns: Sequence[str] | None = None) -> RawCloud:
 
 def read_returns(path: Path, columns: Sequence[str] | None = None) -> RawCloud:
     """The points of a file that are returns, and the names of its fields."""
-    cloud = read_cloud(path, columns)
-    return cloud._replace(points=check_points(cloud.points, path))
+    return only_returns(read_cloud(path, columns), path)
 
 
-def check_points(cloud: NDArray[np.float32], path: Path | str) -> NDArray[np.float32]:
-    """The rows of a cloud (n, 4) with a return."""
-    xyz, (x, y, z) = cloud[:, :3], cloud[:, :3].T
+def only_returns(cloud: RawCloud, path: Path | str) -> RawCloud:
+    """The points with a return."""
+    xyz, (x, y, z) = cloud.points[:, :3], cloud.points[:, :3].T
     measured = ~(np.isnan(x) & np.isnan(y) & np.isnan(z))
     if not measured.any():
         raise FileError(path, "holds no point")
@@ -508,7 +543,10 @@ def check_points(cloud: NDArray[np.float32], path: Path | str) -> NDArray[np.flo
             f"holds a coordinate of {largest:.3g}, expected metres, up to {MAX_COORDINATE:g}; "
             "convert its unit, or mark points without a return by NaN in x, y and z",
         )
-    return cloud if returned.all() else cloud[returned]
+    if returned.all():
+        return cloud
+    times = None if cloud.times is None else cloud.times[returned]
+    return cloud._replace(points=cloud.points[returned], times=times)
 
 
 _MOST_MISSING, _MOST_RATIO = 0.1, 1e12

@@ -17,13 +17,20 @@ from numpy.typing import NDArray
 from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError, DatasetError
 from calibgraph.files import sha256
-from calibgraph.io.bags import MESSAGE_SUFFIX, hash_message, load_bag_cloud, load_bag_image
+from calibgraph.io.bags import (
+    MESSAGE_SUFFIX,
+    hash_message,
+    load_bag_cloud,
+    load_bag_image,
+    load_timed_bag_cloud,
+)
 from calibgraph.io.bags.messages import read_message
 from calibgraph.io.clouds import (
     RawCloud,
     describe_cloud,
     load_cloud,
     read_returns,
+    seconds_after,
     thin_cloud,
     with_intensity,
 )
@@ -191,12 +198,20 @@ class Frame:
             found = self.arrays[path] if path in self.arrays else load_cloud(path, self.columns)
         return thin_cloud(found)
 
-    def load_lidar(self, name: str) -> NDArray[np.float32]:
-        """(n, 4) the cloud of another LiDAR, as it was recorded, in its own frame."""
-        path = self.lidar_paths[name]
+    def load_recorded(self, lidar: str, *, timed: bool) -> tuple[Array, Array | None]:
+        """(n, 3) the cloud of one of several LiDARs, as it was recorded, in its own frame.
+
+        And, if asked, (n,) the times of its points [s] after the frame's stamp; None without.
+        """
+        path, times_s = self.lidar_paths.get(lidar, self.cloud_path), None
         if path.suffix == MESSAGE_SUFFIX:
-            return with_intensity(load_bag_cloud(path))
-        return load_cloud(path)
+            cloud, times_s = load_timed_bag_cloud(path, self.stamp_ns if timed else None)
+        else:
+            found = read_returns(path, self.columns if path == self.cloud_path else None)
+            cloud = found.points
+            if timed and found.times is not None and self.stamp_ns is not None:
+                times_s = seconds_after(self.stamp_ns, found.times, str(path))
+        return cloud[:, :3].astype(np.float64), times_s
 
     def describe_cloud(self) -> list[str]:
         """Notes about its cloud; none if it cannot be read, which is named where it is loaded."""

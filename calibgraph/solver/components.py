@@ -126,8 +126,7 @@ def variance_components(
     prior, sigmas = error_components(), np.asarray(findings.bend_sigmas)
     at_place = np.tile(np.eye(6), (places, len(cameras), 1, 1))
     scatter_at_place, jacobian = at_place.copy(), np.zeros((len(cameras), 6, len(sigmas)))
-    shape = places, len(cameras), len(sigmas)
-    vector, information = np.zeros(shape), np.zeros((*shape, shape[2]))
+    vector, information = np.zeros(len(sigmas)), np.zeros((len(sigmas), len(sigmas)))
     for name, (within, evidence) in shown.items():
         number = cameras.index(name)
         at_place[:, number] = within.at_place(findings.place_variance)
@@ -136,8 +135,8 @@ def variance_components(
         if evidence is not None:
             jacobian[number] = evidence.jacobian * sigmas
             weight = 1.0 / within.mean_variance(findings.place_variance)
-            information[:, number] = weight * np.outer(sigmas, sigmas) * evidence.information
-            vector[:, number] = weight * sigmas * evidence.vector
+            information += weight * np.outer(sigmas, sigmas) * evidence.information
+            vector += weight * sigmas * evidence.vector
     of_place = np.square([findings.place_rotation_rad, findings.place_translation_m])
     components = VarianceComponents(
         cloud=np.eye(6),
@@ -150,7 +149,6 @@ def variance_components(
         pair_distortion_jacobian=np.zeros_like(jacobian),
         distortion_information=information,
         distortion_vector=vector,
-        distortion_weight=np.ones(shape[:2]),
         robust_scale=prior.robust_sigmas if places >= prior.robust_places else np.inf,
     )
     return common_error(components, findings.rigid_sigmas, findings.camera_share)

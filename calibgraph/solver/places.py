@@ -217,18 +217,10 @@ class Linearization:
         return Ties.of(shared, self.inverses, covariance, parts.robust_scale)
 
     @property
-    def weights(self) -> Array:
-        """(P, 1 + N) of the cloud and of each camera at each place, in the robust loss."""
-        return self._by_camera(self.ties.weight, 1.0)
-
-    @property
     def distances(self) -> Array:
         """(P, 1 + N) in sigmas: of o_p from o, of a_cp from m_c; 0 where there are no data."""
-        return self._by_camera(self.ties.distance, 0.0)
-
-    def _by_camera(self, rows: Array, otherwise: float) -> Array:
-        found = np.full((self.model.places, 1 + len(self.model.cameras)), otherwise)
-        found[:, [0, *(1 + number for number in self.model.matched)]] = rows.T
+        found = np.zeros((self.model.places, 1 + len(self.model.cameras)))
+        found[:, [0, *(1 + number for number in self.model.matched)]] = self.ties.distance.T
         return found
 
     @cached_property
@@ -403,7 +395,6 @@ class ErrorFit:
 
     Attributes:
         linear: the graph linearized there.
-        iterations: number of Gauss-Newton steps.
         change: of the cost by the last step, relative to it.
         keys: of the poses that are reported.
         ratios: of its variance components.
@@ -412,7 +403,6 @@ class ErrorFit:
     """
 
     linear: Linearization
-    iterations: int
     change: float
     keys: Sequence[int]
     ratios: VarianceRatios = VarianceRatios()
@@ -496,17 +486,19 @@ def fit_latent_poses(
     present = start if start.model is model else start.with_model(model)
     if not (is_determined or present.is_determined()):
         return None
-    iterations, change = 0, np.inf
-    while iterations < MAX_ITERATIONS and change > relative_tolerance:
+    change = np.inf
+    for _ in range(MAX_ITERATIONS):
         try:
             found = present.descend()
         except np.linalg.LinAlgError:
             return None
         if found is None:  # this is the minimum, to rounding
-            return ErrorFit(present, iterations, 0.0, model.reported_keys)
+            return ErrorFit(present, 0.0, model.reported_keys)
         change = (present.cost - found.cost) / max(present.cost, np.finfo(float).tiny)
-        present, iterations = found, iterations + 1
-    return ErrorFit(present, iterations, change, model.reported_keys)
+        present = found
+        if change <= relative_tolerance:
+            break
+    return ErrorFit(present, change, model.reported_keys)
 
 
 def start_values(model: LatentPoseModel, T_camera_lidar: Mapping[str, Array]) -> Linearization:

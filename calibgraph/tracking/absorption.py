@@ -14,19 +14,16 @@ from calibgraph.model.rig import Rig
 from calibgraph.pipeline import solve
 from calibgraph.solver.columns import distortion_evidence
 from calibgraph.solver.lens import considered_lens, error_by_lens, lens_columns
-from calibgraph.solver.matches import BlockResiduals, CameraBlock, camera_blocks, merge
+from calibgraph.solver.matches import CameraBlock, camera_blocks, merge
 from calibgraph.solver.preprocess import preprocess
-from calibgraph.solver.robust import quantiles
 from calibgraph.solver.within_place import WEAK
 from calibgraph.tracking.cause import chance_limit
 from calibgraph.tracking.estimate import EpochGraph, states_places
 from calibgraph.tracking.events import Event
-from calibgraph.tracking.frame_order import StreamFrame, findings_of
+from calibgraph.tracking.frames import StreamFrame, findings_of
 from calibgraph.tracking.gate import Gated, agrees, find_outlier_frame, sums_of
-from calibgraph.tracking.noise import add_residuals, median, scale_of
 from calibgraph.tracking.state import BEND, COUNTS, HISTORY, OutlierFrame, State
 from calibgraph.tracking.sums import Sums
-from factors import to_runs
 
 _LAST_FRAMES = 20  # of which it is kept whether they agree with the estimate
 _ABSORBED = np.array([[name == one for one in ("given", "used", "absorbed")] for name in COUNTS])
@@ -89,17 +86,6 @@ def keep_matches(state: State, gated: Mapping[int, Gated]) -> None:
         )
         counts[camera] += _ABSORBED @ [len(one.inliers), int(one.counts.sum()), len(one.counts)]
     state.blocks, state.inliers, state.counts = tuple(blocks), tuple(inliers), counts
-
-
-def count_residuals(state: State, camera: int, gated: Gated) -> None:
-    """Count the residuals of frames, and which of them are within the gate."""
-    raw = gated.raw
-    medians = quantiles(gated.residuals.errors_px, to_runs(raw.frame_edges), 0.5)
-    new = np.column_stack([gated.counts / raw.frame_counts, medians])
-    recent = np.concatenate([state.recent[camera], new])[-HISTORY:]
-    histogram = add_residuals(state.histogram[camera], gated.residuals)
-    share = median(recent[~np.isnan(recent[:, 0]), 0])
-    state.put(camera, recent=recent, share=share, histogram=histogram, least=raw.least_spread)
 
 
 def add_to_totals(state: State, frames: Sums) -> None:
@@ -176,17 +162,16 @@ def _set_aside(state: State, camera: int, own: OutlierFrame | None) -> None:
     state.count(camera, left_out=1, failed=1 if own is None else 0)
 
 
-def count_repeats(state: State, given: Correspondences, new: Correspondences) -> None:
+def count_repeats(state: State, given: Correspondences, again: Collection[int]) -> None:
     """Count the frames in a row, per camera, that repeat the one before them.
 
     Args:
         state: of the tracker.
         given: the correspondences of a frame.
-        new: those of cameras that do not repeat.
+        again: numbers of its cameras that repeat.
     """
-    if given is new and not any(state.counted(c, "repeated") for c in range(len(state.names))):
+    if not again and not state.counts[:, COUNTS.index("repeated")].any():
         return
-    again = np.setdiff1d(given.camera_index, new.camera_index)
     for number in np.unique(given.camera_index).tolist():
         camera = state.names.index(given.cameras[number])
         before = state.counted(camera, "repeated")
@@ -273,16 +258,15 @@ def _start_camera(state: State, camera: int, T_camera_lidar: Array) -> None:
     """Absorb a camera's first frames at its first estimate."""
     found = [_camera_block(state, camera, table) for table in state.waiting[camera]]
     usable = [block for block in found if block is not None]
-    histogram = state.histogram[camera]
-    for block in usable:
-        histogram = add_residuals(histogram, BlockResiduals.at(T_camera_lidar, block))
-    scale = scale_of(histogram, usable[-1].least_spread, state.config)
-    curvature = Gated.at(T_camera_lidar, merge(usable), scale).curvature(scale)
-    state.put(camera, scales=scale, curvature=curvature, started=True, waiting=(), refused=())
-    for block in usable:
-        count_residuals(state, camera, Gated.at(T_camera_lidar, block, scale))
-    state.put(camera, references=T_camera_lidar)
-    consider_lens(state, camera, merge(usable))
+    raw = merge(usable)
+    scale = raw.scale(T_camera_lidar, state.config)
+    gated = Gated.at(T_camera_lidar, raw, scale)
+    state.put(
+        camera,
+        started=True, waiting=(), refused=(), references=T_camera_lidar,
+        scales=scale, share=gated.usual_share, curvature=gated.curvature(scale),
+    )  # fmt: skip
+    consider_lens(state, camera, raw)
     absorb_again(state, camera, usable, T_camera_lidar)
 
 
@@ -349,7 +333,7 @@ def bend_epoch(state: State, epoch: int, camera: int) -> None:
             places = [np.array(of_place, dtype=np.int64) for of_place in at.values()]
             pose = to_T_lidar_camera(state.poses[epoch, camera])
             scale = state.scales[camera]
-            one = distortion_evidence(block, scale, pose, WEAK, places=places).as_of_one_place()
+            one = distortion_evidence(block, scale, pose, WEAK, places=places)
             pulled = one.hessian @ one.jacobian
             parts = one.hessian, pulled, one.information, one.vector
             found = np.concatenate([part.ravel() for part in parts])

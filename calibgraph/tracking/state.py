@@ -26,13 +26,13 @@ from calibgraph.model.rig import Rig
 from calibgraph.solver.matches import CameraBlock, merge
 from calibgraph.solver.robust import ResidualScale
 from calibgraph.tracking.events import Event
-from calibgraph.tracking.noise import BINS, inflation
+from calibgraph.tracking.noise import inflation
 from calibgraph.tracking.sums import Numbers, PlaceSums, Sums
 
 Item = TypeVar("Item")
 
 LEAST_FRAMES = 15  # for the scatter of a six-vector
-HISTORY = 50  # frames over which the residuals' size and the share of inliers are taken
+HISTORY = 50  # frames that a camera may start from
 STRENGTHS = np.array([0.0, 0.2, 1.0, 5.0])
 """The walks of a camera, in units of the configured one; the first is static."""
 COUNTS = "given", "used", "left_out", "failed", "absorbed", "repeated"
@@ -147,10 +147,7 @@ class State:
         total_frames: (n,) and of frames.
         started: (n,) whether a camera has an estimate of its own.
         scales: of each camera's residuals.
-        histogram: (n, 2, b) of their sizes.
-        least: (n,) lower bounds of their whitened spread.
-        recent: (n, 50, 2) of the last absorbed frames, NaN before: share of inliers, median [px].
-        share: (n,) median of these shares.
+        share: (n,) of a frame's matches that is usually within the gate.
         absent: (n,) frames since the last usable one.
         moved_at: (n,) number of updates when a camera last moved, or -1.
         drift_reported_at: (n,) number of updates when its drift was last reported, or -1.
@@ -200,9 +197,6 @@ class State:
     total_frames: Array
     started: Mask
     scales: tuple[ResidualScale, ...]
-    histogram: Array
-    least: Array
-    recent: Array
     share: Array
     absent: Numbers
     moved_at: Numbers
@@ -264,9 +258,6 @@ class State:
             total_frames=np.zeros(n),
             started=np.zeros(n, np.bool_),
             scales=(ResidualScale(1.0, 1.0, 1.0, 1.0),) * n,
-            histogram=np.zeros((n, 2, BINS)),
-            least=np.zeros(n),
-            recent=np.full((n, HISTORY, 2), np.nan),
             share=np.ones(n),
             absent=np.zeros(n, np.int64),
             moved_at=np.full(n, -1),
@@ -360,11 +351,6 @@ class State:
     def rig_at(self, T_camera_lidar: Array) -> Rig:
         """The rig with (n, 4, 4) estimates."""
         return self.rig.moved_to(dict(zip(self.names, T_camera_lidar, strict=True)))
-
-    def known_recent(self, camera: int) -> Array:
-        """(f, 2) of the last absorbed frames."""
-        own = self.recent[camera]
-        return np.asarray(own[~np.isnan(own[:, 0])])
 
     def walk_variance(self, strengths: Array, frames: int) -> Array:
         """(w, 6) variance of walks of (w,) strengths, in units of the configured one."""

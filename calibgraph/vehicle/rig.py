@@ -5,11 +5,13 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
 from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError, DatasetError
+from calibgraph.io.clouds import TIMES
 from calibgraph.io.dataset import Dataset, spread_out
 from calibgraph.io.frame import Frame
 from calibgraph.model.config import Config
@@ -20,14 +22,17 @@ from calibgraph.trust.probability import TABLES, judge, probability_beyond
 from calibgraph.trust.thresholds import threshold
 from calibgraph.vehicle.frame import Road, find_road, find_vehicle
 from calibgraph.vehicle.lidars import GUESS_SIGMAS, LidarPoses, calibrate_lidars
+from calibgraph.vehicle.motion import Instant, read_instants
 from calibgraph.vehicle.start import locate_lidars
 from calibgraph.vehicle.travel import POSE_FILES, Travel, direction_of_travel, read_poses
 
 MOST_INSTANTS = 20
 """Of a recording, spread over it: more hardly narrow what places differ by."""
 
+_ROUNDS = 2  # while it moves: clouds are brought to one time by the poses found
 _LOOSE = 0.3  # sigma of an axis over that of the guess: planes hardly determine it
 _OPEN = 0.98  # probability of an error by a bar alone: what is open is not known to be wrong
+_EITHER = 0.5  # the same, where another pose fits as well
 _AXES = ("roll x", "pitch y", "yaw z", "x", "y", "z")
 _log = logging.getLogger(__name__)
 
@@ -56,7 +61,8 @@ def calibrate_rig_lidars(
 ) -> LidarResult:
     """The poses of a rig's LiDARs in its base, from clouds of instants.
 
-    The vehicle stands at each instant, or the clouds of an instant have been brought to one time.
+    Where the vehicle is known to move, clouds are brought to one time by the points' times, or left
+    out without these; else they are taken as they are.
 
     Args:
         dataset: its frames have the clouds of all LiDARs; those that lack one are left out.
@@ -72,25 +78,26 @@ def calibrate_rig_lidars(
     warnings = []
     if left := len(dataset.frames) - len(frames):
         warnings.append(f"{left} of {len(dataset.frames)} instants lack a cloud and are left out")
-    chosen = spread_out(frames, MOST_INSTANTS)
-    clouds = dict[str, list[Array]]({name: [] for name in (rig.lidar, *rig.other_lidars)})
-    for number, frame in enumerate(chosen):
-        progress("reading clouds of LiDARs", number, len(chosen))
-        clouds[rig.lidar].append(frame.load_cloud()[:, :3].astype(np.float64))
-        for name in rig.other_lidars:
-            clouds[name].append(frame.load_lidar(name)[:, :3].astype(np.float64))
+    names, path = (rig.lidar, *rig.other_lidars), _pose_file(dataset)
+    progress("reading clouds of LiDARs", 0, 1)
+    instants, lines = _usable(read_instants(spread_out(frames, MOST_INSTANTS), names, path))
+    warnings += lines
     guess = {name: rig.T_base_lidar.get(name) for name in rig.other_lidars}
     known = {name: T for name, T in guess.items() if T is not None}
+    clouds = _at_stamps(instants, {rig.lidar: np.eye(4), **guess})
     progress("locating LiDARs", 0, 1)
     try:
-        start = locate_lidars(clouds, guess, base=rig.lidar)
+        start, doubts = locate_lidars(clouds, guess, base=rig.lidar)
     except CalibrationError as error:
         if len(known) < len(guess):
             raise
         warnings.append(f"{error}; begun from the guess")
-        start = known
-    progress("calibrating LiDARs", 0, 1)
-    poses = calibrate_lidars(clouds, start, base=rig.lidar)
+        start, doubts = known, {}
+    for number in range(_ROUNDS if any(each.twist_per_s is not None for each in instants) else 1):
+        progress("calibrating LiDARs", number, _ROUNDS)
+        clouds = _at_stamps(instants, {rig.lidar: np.eye(4), **start})
+        poses = calibrate_lidars(clouds, start, base=rig.lidar)
+        start = dict(poses.T_base_lidar)
     lidars = {rig.lidar: Lidar()} | {
         name: Lidar(T_base_lidar=poses.T_base_lidar[name], covariance=poses.covariance[name])
         for name in rig.other_lidars
@@ -98,7 +105,7 @@ def calibrate_rig_lidars(
     vehicle = None
     if rig.vehicle is not None:
         progress("finding the vehicle's frame", 0, 1)
-        vehicle, unknown = find_vehicle(rig.vehicle, _road(clouds, poses), _travel(dataset))
+        vehicle, unknown = find_vehicle(rig.vehicle, _road(clouds, poses), _travel(path))
         warnings += unknown
     for line in warnings:
         _log.warning(line)
@@ -106,7 +113,10 @@ def calibrate_rig_lidars(
         {name: lidars[name] for name in rig.lidars or {}},
         vehicle,
         poses,
-        {name: judge_lidar(poses, name, config.tolerance) for name in rig.other_lidars},
+        {
+            name: judge_lidar(poses, name, config.tolerance, doubt=doubts.get(name, ""))
+            for name in rig.other_lidars
+        },
         tuple(warnings),
     )
 
@@ -126,11 +136,39 @@ def _road(clouds: Mapping[str, Sequence[Array]], poses: LidarPoses) -> Road | No
         return None
 
 
-def _travel(dataset: Dataset) -> Travel | None:
-    """The direction of travel by the poses beside the data; None without any."""
+def _pose_file(dataset: Dataset) -> Path | None:
+    """Of the poses beside the data; None without any."""
     paths = (folder / name for folder in dataset.folders for name in POSE_FILES)
-    path = next((path for path in paths if path.is_file()), None)
-    return None if path is None else direction_of_travel(read_poses(path))
+    return next((path for path in paths if path.is_file()), None)
+
+
+def _travel(poses: Path | None) -> Travel | None:
+    """The direction of travel; None without poses."""
+    return None if poses is None else direction_of_travel(read_poses(poses)[0])
+
+
+def _usable(instants: Sequence[Instant]) -> tuple[list[Instant], list[str]]:
+    """Those that stand or can be brought to one time, and lines on the others."""
+    usable = [each for each in instants if each.is_usable]
+    if not usable:
+        raise DatasetError(
+            f"in all {len(instants)} instants the vehicle moves, and points have no times: record "
+            f"while it stands, or clouds with a field of times ({', '.join(TIMES)})"
+        )
+    lines, moving = [], sum(each.twist_per_s is not None for each in usable)
+    if left := len(instants) - len(usable):
+        lines.append(f"{left} of {len(instants)} instants are left out: the vehicle moves, and "
+                     "points have no times")  # fmt: skip
+    if moving:
+        lines.append(f"in {moving} of {len(usable)} instants the vehicle moves: their clouds are "
+                     "brought to one time by the points' times")  # fmt: skip
+    return usable, lines
+
+
+def _at_stamps(
+    instants: Sequence[Instant], T_base_lidar: Mapping[str, Array | None]
+) -> dict[str, list[Array]]:
+    return {name: [each.at_stamp(name, T) for each in instants] for name, T in T_base_lidar.items()}
 
 
 def _complete(frames: Sequence[Frame], rig: Rig) -> list[Frame]:
@@ -145,10 +183,13 @@ def _complete(frames: Sequence[Frame], rig: Rig) -> list[Frame]:
     return complete
 
 
-def judge_lidar(poses: LidarPoses, name: str, tolerance: tuple[float, float]) -> Verdict:
+def judge_lidar(
+    poses: LidarPoses, name: str, tolerance: tuple[float, float], *, doubt: str = ""
+) -> Verdict:
     """The verdict of one LiDAR for a tolerance [deg, cm].
 
-    What counts data is in the error bar, and no sign of an error.
+    What counts data is in the error bar, and no sign of an error. The doubt is about the start:
+    where another pose fits as well.
     """
     covariance = poses.covariance[name]
     checks = [
@@ -160,6 +201,9 @@ def judge_lidar(poses: LidarPoses, name: str, tolerance: tuple[float, float]) ->
         apart = float(np.sqrt(max(poses.place_ratios)))
         checks.append(threshold("lidar_places").check(apart))
     beyond = min(probability_beyond(covariance, tolerance), _OPEN)
+    if doubt:
+        checks.append(Check("another placement", "WARN", doubt, kind="lidar_start"))
+        beyond = max(beyond, _EITHER)
     signs = [check for check in checks if (check.kind or check.name) not in ABOUT_THE_DATA]
     return replace(judge(signs, beyond, tolerance, TABLES), checks=tuple(checks))
 

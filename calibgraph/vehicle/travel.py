@@ -49,34 +49,40 @@ class Travel:
     straight_m: float
 
 
-def read_poses(path: Path | str) -> Array:
-    """(n, 4, 4) T_world_lidar of a text file, in order of time.
+def read_poses(path: Path | str) -> tuple[Array, Array | None]:
+    """(n, 4, 4) T_world_lidar of a text file, in order of time, and (n,) their times [s], if any.
 
     A line has 12 numbers of the upper rows of the matrix (KITTI), the same after a time, or time
     x y z qx qy qz qw (TUM), with blanks or commas between them; lines after a # are skipped.
 
     Raises:
-        FileError: if a line is none of these, or there are fewer than two.
+        FileError: if a line is none of these or unlike the first, or there are fewer than two.
     """
     path = Path(path)
     lines = [line.strip() for line in read_text(path).splitlines()]
-    poses = [
-        _pose(line.replace(",", " ").split(), path, number)
+    rows = [
+        (number, line.replace(",", " ").split())
         for number, line in enumerate(lines, 1)
         if line and not line.startswith("#")
     ]
-    if len(poses) < 2:  # noqa: PLR2004
-        raise FileError(path, f"holds {len(poses)} poses, at least 2 are needed")
-    return np.array(poses)
+    if len(rows) < 2:  # noqa: PLR2004
+        raise FileError(path, f"holds {len(rows)} poses, at least 2 are needed")
+    for number, words in rows:
+        if len(words) != len(rows[0][1]):
+            raise FileError(path, f"line {number} has {len(words)} numbers, the first has others")
+    poses, times = zip(*(_pose(words, path, number) for number, words in rows), strict=True)
+    return np.array(poses), None if times[0] is None else np.array(times)
 
 
-def _pose(words: list[str], path: Path, number: int) -> Array:
+def _pose(words: list[str], path: Path, number: int) -> tuple[Array, float | None]:
     try:
         values = np.array(words, dtype=np.float64)
+        time_s = None if len(values) == _MATRIX else float(values[0])
         if len(values) == _TUM:
-            return pose_of_quaternion(values[1:4].tolist(), values[4:].tolist())
+            return pose_of_quaternion(values[1:4].tolist(), values[4:].tolist()), time_s
         if len(values) in (_MATRIX, _TIME_MATRIX):
-            return rigid_transform([*values[-_MATRIX:].reshape(3, 4).tolist(), [0, 0, 0, 1]])
+            T = rigid_transform([*values[-_MATRIX:].reshape(3, 4).tolist(), [0, 0, 0, 1]])
+            return T, time_s
     except ValueError as error:
         raise FileError(path, f"line {number}: {error}") from error
     raise FileError(

@@ -95,17 +95,20 @@ def test_poses_are_read_as_matrices_and_as_tum(tmp_path):
         "tum.txt": ["# time x y z qx qy qz qw", *tum],
     }.items():  # fmt: skip
         (tmp_path / name).write_text("\n".join(lines))
-        np.testing.assert_allclose(read_poses(tmp_path / name), poses, atol=1e-9)
+        found, times_s = read_poses(tmp_path / name)
+        np.testing.assert_allclose(found, poses, atol=1e-9)
+        assert (times_s is None) == (name == "kitti.txt")
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("1 2 3\n", "line 1 has 3 numbers; expected 12 of a matrix"),
+        ("1 2 3\n" * 2, "line 1 has 3 numbers; expected 12 of a matrix"),
         ("0 0 0 0 0 0 0 2\n" * 2, "line 1: quaternion .* has length 2"),
-        ("# t\n" + "1 0 0 0 0 2 0 0 0 0 1 0\n", "line 2: the upper left 3x3 is not a rotation"),
+        ("# t\n" + "1 0 0 0 0 2 0 0 0 0 1 0\n" * 2, "line 2: the upper left 3x3 is not a rotation"),
         ("1 0 0 0 0 1 0 0 0 0 1 0\n", "holds 1 poses"),
-        ("0 a 0 0 0 0 0 1\n", "line 1: could not convert"),
+        ("0 0 0 0 0 0 0 1\n1 0 0 0 0 1 0 0 0 0 1 0\n", "line 2 has 12 numbers, the first has"),
+        ("0 a 0 0 0 0 0 1\n" * 2, "line 1: could not convert"),
     ],
 )
 def test_wrong_poses_are_named_with_their_line(tmp_path, text, message):

@@ -133,6 +133,26 @@ def test_transforms_of_lidars_and_vehicle_are_exported(result: Calibration, tmp_
 
 
 @pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (None, "its roll, pitch, yaw, x, y, z are unknown"),
+        ({"T_vehicle_lidar": None}, "its roll, pitch, yaw, x, y, z are unknown"),
+        ({"translation_sigma_m": (np.inf, 0.1, 0.1)}, "top in base_link is left out, as its x are"),
+    ],
+)
+@pytest.mark.parametrize("format", ["autoware", "urdf"])
+def test_a_pose_in_the_vehicle_that_is_not_written_is_named(
+    format: str, change: dict | None, named: str, result: Calibration, tmp_path: Path, call: Call
+):
+    vehicle = None if change is None else result.rig.vehicle.model_copy(update=change)
+    folder = tmp_path / "out"
+    replace(result, rig=result.rig.model_copy(update={"vehicle": vehicle})).save(folder)
+    code, _, err = call("export", folder, "--format", format, "--out", tmp_path / "kit")
+    assert code == 0 and named in err and not (tmp_path / "sensors_calibration.yaml").exists()
+    assert ("sensors_calibration.yaml is not written" in err) == (format == "autoware")
+
+
+@pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"lidars": None}, "cameras: the rig has none; name one, or at least two lidars"),
@@ -202,13 +222,13 @@ def test_a_bag_has_a_topic_of_clouds_per_lidar(tmp_path: Path):
     assert "2 clouds, 2 with all clouds of other LiDARs within 0.05 s" in " ".join(data.notes)
     for number, frame in enumerate(data.frames):
         for name, of in clouds.items():
-            found = frame.load_cloud() if name == "top" else frame.load_lidar(name)
+            found, _ = frame.load_recorded(name, timed=False)
             np.testing.assert_array_equal(found[:, :3], of[number].astype(np.float32))
     with pytest.raises(DatasetError, match=r"LiDAR 'roof'\? .*--topic roof=/TOPIC"):
         lidars = {"top": rig.lidars["top"], "roof": rig.lidars["left"]}
         calibgraph.load_dataset(bag, rig.model_copy(update={"lidars": lidars}))
-    with pytest.raises(DatasetError, match="several LiDARs are not corrected for motion"):
-        calibgraph.load_dataset(bag, rig, bag=calibgraph.BagOptions(motion="scans"))
+    moving = calibgraph.load_dataset(bag, rig, bag=calibgraph.BagOptions(motion="scans"))
+    assert all(frame.is_corrected for frame in moving.frames)
 
 
 @pytest.mark.slow

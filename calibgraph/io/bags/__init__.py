@@ -15,9 +15,11 @@ from calibgraph.errors import FileError
 from calibgraph.io.bags.messages import MESSAGE_SUFFIX as MESSAGE_SUFFIX
 from calibgraph.io.bags.messages import read_message
 from calibgraph.io.bags.pictures import image_from_message
-from calibgraph.io.bags.point_clouds import cloud_from_message, time_fields, timed_points_of
+from calibgraph.io.bags.point_clouds import cloud_from_message, timed_points_of
 from calibgraph.io.bags.storage import BagOptions as BagOptions
 from calibgraph.io.bags.storage import is_bag as is_bag
+from calibgraph.io.bags.transforms import stamp_ns_of
+from calibgraph.io.clouds import time_fields
 
 Correction = Callable[[NDArray[np.float32], Array], Array]
 """Of (n, 3) points for motion, by (n,) times after the stamp [s]."""
@@ -34,6 +36,18 @@ def load_bag_cloud(path: Path, correct: Correction | None = None) -> NDArray[np.
     if not len(cloud):
         raise FileError(path, "holds no point")
     return cloud
+
+
+def load_timed_bag_cloud(
+    path: Path, start_ns: int | None
+) -> tuple[NDArray[np.float32], Array | None]:
+    """(n, 4) the cloud in a message, and its points' times [s] after another stamp, if any."""
+    content = read_message(path)[1]
+    if start_ns is None:
+        return load_bag_cloud(path), None
+    cloud, times_s = timed_points_of(content, str(path))
+    has_times = time_fields(each.name for each in content.fields)
+    return cloud, times_s + (stamp_ns_of(content) - start_ns) / 1e9 if has_times else None
 
 
 def scan_duration_s(path: Path) -> float | None:

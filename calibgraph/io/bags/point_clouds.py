@@ -9,14 +9,11 @@ from numpy.typing import NDArray
 
 from calibgraph.errors import DatasetError
 from calibgraph.io.bags.messages import describe_message
-from calibgraph.io.clouds import find_intensity, make_cloud
+from calibgraph.io.bags.transforms import stamp_ns_of
+from calibgraph.io.clouds import TIMES, find_intensity, make_cloud, seconds_after, time_fields
 
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-_TIMES = ("t", "time", "timestamp", "offset_time", "time_offset", "time_stamp")
-"""Of Ouster, Velodyne, Hesai, Livox, and Autoware."""
 _LIKE_A_TIME = re.compile(r"time|stamp|^ts?_|_ts?$|^(ts|dt|sec|nsec|usec|t\d)")
-_STAMPS, _NANOSECOND_STAMPS = 1e6, 1e15  # times since a scan's start are smaller, since 1970 larger
-_LONGEST_S = 1.0
 
 
 def cloud_from_message(message: Any, where: str = "") -> NDArray[np.float32]:
@@ -40,9 +37,6 @@ def cloud_from_message(message: Any, where: str = "") -> NDArray[np.float32]:
 def timed_points_of(message: Any, where: str) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
     """The points of a message that are returns, and when each was taken.
 
-    Times are whole numbers of nanoseconds after the stamp (Ouster, Livox), float32 seconds after it
-    (Velodyne), or float64 stamps of their own, in seconds (Hesai, RoboSense) or nanoseconds.
-
     Returns:
         (n, 4) as of :func:`cloud_from_message`; (n,) seconds after the stamp, zeros if points have
         no times.
@@ -53,25 +47,7 @@ def timed_points_of(message: Any, where: str) -> tuple[NDArray[np.float32], NDAr
     if not names:
         return points, np.zeros(len(points))
     times = _structured(message, where, names[:1])[names[0]][returned]
-    return points, _seconds_after(message.header.stamp, times, f"{where}: {names[0]}")
-
-
-def _seconds_after(stamp: Any, times: NDArray[Any], where: str) -> NDArray[np.float64]:
-    if times.dtype.kind in "iu":
-        seconds = times.astype(np.float64) / 1e9
-    elif times.max(initial=0.0) > _NANOSECOND_STAMPS:
-        stamp_ns = stamp.sec * 1e9 + stamp.nanosec
-        seconds = (times.astype(np.float64) - stamp_ns) / 1e9
-    elif times.max(initial=0.0) > _STAMPS:
-        seconds = times.astype(np.float64) - stamp.sec - stamp.nanosec / 1e9
-    else:
-        seconds = times.astype(np.float64)
-    if not np.all(np.abs(seconds) <= _LONGEST_S):  # not finite, too
-        raise DatasetError(
-            f"{where}: times from {np.min(seconds):.3g} to {np.max(seconds):.3g} s after the "
-            "stamp are not those of one scan; leave out --motion, or record it again"
-        )
-    return seconds
+    return points, seconds_after(stamp_ns_of(message), times, f"{where}: {names[0]}")
 
 
 def _all_points(message: Any, where: str) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
@@ -91,14 +67,9 @@ def has_points(message: Any, where: str) -> bool:
         return bool((np.isfinite(x) & (x != 0)).any())
 
 
-def time_fields(names: Iterable[str]) -> list[str]:
-    """The fields that give each point a time: such clouds are often as they were scanned."""
-    return [name for name in names if name in _TIMES]
-
-
 def doubtful_time_fields(names: Iterable[str]) -> list[str]:
     """The fields that may be times by their names, and are not read."""
-    return [name for name in names if name not in _TIMES and _LIKE_A_TIME.search(name.lower())]
+    return [name for name in names if name not in TIMES and _LIKE_A_TIME.search(name.lower())]
 
 
 def _structured(message: Any, where: str, chosen: Sequence[str] = ()) -> NDArray[np.void]:
