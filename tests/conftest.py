@@ -58,9 +58,12 @@ KANNALA = (0.02, -0.004, 0.001, -0.0002)
 
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Files with slow tests come first: at the end one process would wait for the other."""
+    """Files with slow tests come first: at the end one process would wait for the other.
+
+    Then those of ``vehicle``: processes that share the last files each make what is made once.
+    """
     slow = {item.path for item in items if item.get_closest_marker("slow")}
-    items.sort(key=lambda item: item.path not in slow)
+    items.sort(key=lambda item: (item.path not in slow, item.path.parent.name != "vehicle"))
 
 
 def pytest_collection_finish() -> None:

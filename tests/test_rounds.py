@@ -231,6 +231,7 @@ def test_a_camera_whose_matches_are_displaced_comes_back_to_its_neighbour(
     assert {"match_cameras", "solve_pairs"} <= tied.watch.seconds.keys()
 
 
+@pytest.mark.slow
 def test_cameras_are_matched_through_the_lenses_that_were_estimated(
     data: Dataset, truth: Rig
 ) -> None:
@@ -320,6 +321,8 @@ def late_sample() -> Dataset:
     return dataset_from_arrays(rig, clouds, {ONE: images}, twists_per_s=twists)
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_offset_and_readout_are_found_with_the_pose() -> None:
     data, rig = late_sample(), one_camera()
     start = perturb(rig, rotation_deg=1.0, translation_m=0.1, seed=0)

@@ -237,7 +237,7 @@ def export(
     from calibgraph.io.rigs import load_rig
     from calibgraph.model.plausibility import MAX_DISTANCE_M, find_implausible
 
-    with checked_arguments():
+    with checked_arguments(), progress_bar("writing"):
         T_base_lidar = None if lidar_pose is None else _parse_pose(lidar_pose)
         written = export_calibration(
             source, out, format, cameras=camera or None, lidar_frame=lidar_frame,

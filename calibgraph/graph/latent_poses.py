@@ -32,7 +32,6 @@ from calibgraph.arrays import Array
 from calibgraph.graph.by_place import (
     BlockByPlace,
     PairByPlace,
-    QuadraticByPlace,
 )
 from calibgraph.graph.components import EXACT, VarianceComponents, shown_distortion
 from calibgraph.graph.lens import LensTerm, lens_graph
@@ -54,11 +53,8 @@ from calibgraph.model.config import Reported
 from factors import (
     displaced_between_factor,
     placed_factor,
-    robust_noise,
     to_runs,
 )
-
-Data = BlockByPlace | QuadraticByPlace
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +63,7 @@ class LatentPoseModel:
 
     Attributes:
         cameras: their names.
-        blocks: correspondences, per camera that has some, or the quadratics that are left of them.
+        blocks: correspondences, per camera that has some.
         pairs: camera-to-camera matches.
         pose_graph: priors and measured relative poses, on ``x_c``; marginals of places that are
             not in the graph, on ``o`` and ``m_c``.
@@ -81,7 +77,7 @@ class LatentPoseModel:
     """
 
     cameras: tuple[str, ...]
-    blocks: Mapping[str, Data]
+    blocks: Mapping[str, BlockByPlace]
     pairs: Sequence[PairByPlace]
     pose_graph: gtsam.NonlinearFactorGraph
     components: VarianceComponents
@@ -279,10 +275,7 @@ def latent_pose_graph(model: LatentPoseModel) -> gtsam.NonlinearFactorGraph:
 
 
 def data_graph(model: LatentPoseModel) -> gtsam.NonlinearFactorGraph:
-    """One factor per camera and place, and one per pair and place; lossless.
-
-    A summary of earlier correspondences is another factor of its camera and place.
-    """
+    """One factor per camera and place, and one per pair and place; lossless."""
     graph = gtsam.NonlinearFactorGraph()
     for place, camera in model.matched_places:
         keys = [cloud_at_key(place), matched_at_key(place, camera), *model.lens_keys(camera)]
@@ -330,4 +323,5 @@ def _noise(covariance: Array) -> gtsam.noiseModel.Gaussian:
 
 def _robust(covariance: Array, scale: float) -> gtsam.noiseModel.Base:
     noise = _noise(covariance)
-    return noise if np.isinf(scale) else robust_noise(noise, loss="geman_mcclure", scale=scale)
+    loss = gtsam.noiseModel.mEstimator.GemanMcClure.Create(scale)
+    return noise if np.isinf(scale) else gtsam.noiseModel.Robust.Create(loss, noise)

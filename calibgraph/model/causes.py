@@ -133,6 +133,8 @@ CAUSES: dict[str, Cause] = {
          "lidar_instants": "Record at least 3 instants at different places.",
          "lidar_loose": "Record where surfaces of three directions are in view of both LiDARs: "
          "ground, and walls along and across the road.",
+         "lidar_start": "Write a guess of T_base_lidar into rig.yaml, within 30 deg and 2 m, or "
+         "record where the surroundings look different from both ends.",
          "image evidence": _STRUCTURE,
          "images": "Calibrate again from images and clouds.",
          "common_error": "State the error that all frames share (0 if none): common_deg and "
@@ -145,8 +147,7 @@ CAUSES: dict[str, Cause] = {
         "",
         {"free": "Give correspondences over the whole image, and at several distances.",
          "no_error_bar": "Mend the camera whose pose is free, or leave it out.",
-         "sigma_rotation": "", "sigma_translation": "", "flat_evidence": "", "went_on": _STRUCTURE,
-         "beyond_tolerance": _STRUCTURE},
+         "sigma_rotation": "", "sigma_translation": "", "flat_evidence": "", "went_on": _STRUCTURE},
     ),
     "other": Cause("", {}),  # of another version
 }

@@ -10,7 +10,6 @@ from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, Validat
 
 from calibgraph.files import StrictNumbers, checked_model, describe, read_yaml
 from calibgraph.model.verdict import TOLERANCE
-from factors import LossName
 
 Terms = Literal["stage1", "reprojection", "priors", "full"]
 TERMS: tuple[Terms, ...] = get_args(Terms)
@@ -78,8 +77,7 @@ class Config(StrictNumbers):
         preset: the preset these settings started from.
         prior_weight: lambda, the per-camera prior's weight.
         relative_prior_weight: mu, the relative-pose prior's weight.
-        loss: name of the robust loss.
-        loss_scale_px: delta. None: from the residuals' own spread, per camera.
+        loss_scale_px: delta of Cauchy's loss. None: from the residuals' own spread, per camera.
         gate_px: tau, on the unweighted reprojection error. None: from the residuals' spread.
         confidence_min: c_min.
         confidence_weights: weigh residuals by sqrt(clip(c, 0.1, 1)), else uniformly.
@@ -114,7 +112,6 @@ class Config(StrictNumbers):
     preset: PresetName = "auto"
     prior_weight: Weight = 1.0
     relative_prior_weight: Weight = 5.0
-    loss: LossName = "cauchy"
     loss_scale_px: Pixels | None = None
     gate_px: Pixels | None = None
     confidence_min: Annotated[float, Field(ge=0, le=1)] = 0.1

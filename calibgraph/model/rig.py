@@ -321,6 +321,9 @@ class Lidar(_Model):
     covariance: PoseCovariance | None = None
 
 
+VEHICLE_AXES = ("roll", "pitch", "yaw", "x", "y", "z")
+
+
 class Vehicle(_Model):
     """The vehicle's frame, and what is known of the base LiDAR in it.
 
@@ -341,6 +344,12 @@ class Vehicle(_Model):
                 np.broadcast_to(self.translation_sigma_m, 3),
             ]
         )
+
+    @property
+    def unknown_axes(self) -> tuple[str, ...]:
+        """Those of which nothing is known: a sigma is infinite, or there is no pose."""
+        unknown = np.isinf(self.sigmas) | (self.T_vehicle_lidar is None)
+        return tuple(axis for axis, is_so in zip(VEHICLE_AXES, unknown, strict=True) if is_so)
 
 
 class Rig(_Model):

@@ -156,7 +156,7 @@ def fit_columns(
     near = loss_scale is not None  # elsewhere the second derivative may lead away
     for _ in range(_MAX_ITERATIONS):
         scale = loss_scale or _median_scale(block.block, T_camera_lidar, free, values)
-        sums = block.block.rescale(scale=scale, loss="cauchy").summarize(
+        sums = block.block.rescale(scale=scale).summarize(
             T_camera_lidar[None], runs, free, step=values, curvature=near
         )
         hessian = used = sums.hessian.sum(axis=0) + weak
@@ -286,7 +286,7 @@ def distortion_evidence(
     )
     values = np.zeros(len(free))
     values[: len(known)] = 0.0 if lens is None else lens.values
-    squares = some.block.select(order).rescale(scale=scale.loss_scale, sigma=scale.sigma, loss="l2")
+    squares = some.block.select(order).rescale(scale=math.inf, sigma=scale.sigma)
     T = to_T_camera_lidar(T_lidar_camera)[None]
     sums = squares.summarize(T, to_runs(edges), free, values)
     size = 6 + len(known)  # of what follows

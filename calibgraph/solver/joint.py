@@ -209,10 +209,8 @@ def add_camera_pairs(solution: Solution, matches: CameraMatches) -> Solution:
         The same optimum where no pair of cameras has enough in common.
     """
     alone, watch = replace(solution.without_pairs(), camera_matches=matches), Stopwatch()
-    stops = solution.correspondences.places
-    by_stop = replace(matches, frame=stops.merge_stationary(matches.frame))
     with watch("camera_pairs"):
-        refined = refine_with_pairs(alone.fitted, by_stop)
+        refined = refine_with_pairs(alone.fitted, alone.pair_terms, alone.pairs_alone)
         inliers, optimum = refined or (alone.inliers, alone.optimum)
     with watch("error_model"):
         at = FittedObjective(inliers, alone.scales, optimum.T_camera_lidar, alone.held)

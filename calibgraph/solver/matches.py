@@ -168,8 +168,6 @@ class CameraBlock:
         sample = self.select_evenly(_MAX_SAMPLE)
         root = None if sample.information is None else constrained_root(sample.information)
         errors = sample.block.rewhiten(root).rescale(scale=scale_px)
-        if errors.loss != "cauchy":
-            errors = replace(errors, loss="cauchy")
         return int(np.argmin(errors.costs_at_each(np.array(candidates))))
 
     def scale(self, T_camera_lidar: Array, config: Config) -> ResidualScale:
@@ -225,7 +223,7 @@ def camera_block(camera: Camera, rows: Correspondences, config: Config) -> Camer
     """The preprocessed correspondences of one camera, their points at the times of the pixels."""
     root, motion = sqrt_information(rows, config), motion_of(camera, rows)
     points = at_pixels(camera, rows).points_lidar_m
-    block = ProjectionBlock(camera.lens, points, rows.pixels_px, root, config.loss, motion=motion)
+    block = ProjectionBlock(camera.lens, points, rows.pixels_px, root, motion=motion)
     return CameraBlock(block, rows.information_px, rows.frame)
 
 

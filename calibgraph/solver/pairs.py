@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.model.camera_matches import CameraMatches
-from calibgraph.model.config import Config
 from calibgraph.model.findings import error_components
 from calibgraph.model.geometry import inverse_ranges, to_T_lidar_camera
 from calibgraph.model.rig import Rig
@@ -56,6 +55,11 @@ class PairTerm:
     b: str
     block: PairBlock
     frame: NDArray[np.int64]
+
+    @property
+    def pair(self) -> frozenset[str]:
+        """Its cameras."""
+        return frozenset((self.a, self.b))
 
     @cached_property
     def frame_edges(self) -> NDArray[np.int64]:
@@ -119,7 +123,7 @@ def usual_excess(terms: Sequence[PairTerm]) -> float:
     return 1 + error_components().pair_correlation * max(0.0, len(numbers) / frames - 1)
 
 
-def pair_terms(rig: Rig, table: CameraMatches, config: Config) -> tuple[PairTerm, ...]:
+def pair_terms(rig: Rig, table: CameraMatches) -> tuple[PairTerm, ...]:
     """The terms of all pairs of a table: A's features in B, B's in A, and epipolar.
 
     The epipolar residual is that of features without a surface in either camera, of pairs that have
@@ -128,19 +132,17 @@ def pair_terms(rig: Rig, table: CameraMatches, config: Config) -> tuple[PairTerm
     Args:
         rig: lenses, and extrinsics at which surfaces are ahead of a camera.
         table: with surfaces.
-        config: the loss.
     """
     terms = []
     for a, b in table.pairs():
         rows = table.of_pair(a, b)
         rows = rows.select(np.argsort(rows.frame, kind="stable"))
         sides = [
-            _term_of_side(rig, names, side, rows, config=config)
-            for side, names in enumerate(((a, b), (b, a)))
+            _term_of_side(rig, names, side, rows) for side, names in enumerate(((a, b), (b, a)))
         ]
         terms += sides
         if sum(len(term.frame) for term in sides) < ENOUGH_SURFACES:
-            terms.append(_epipolar_term(rig, (a, b), rows, config))
+            terms.append(_epipolar_term(rig, (a, b), rows))
     return tuple(term for term in terms if len(term.frame) >= MIN_PAIR_MATCHES)
 
 
@@ -186,9 +188,7 @@ def match_errors_px(rig: Rig, table: CameraMatches) -> Array:
     return errors
 
 
-def _term_of_side(
-    rig: Rig, names: tuple[str, str], side: int, rows: CameraMatches, *, config: Config
-) -> PairTerm:
+def _term_of_side(rig: Rig, names: tuple[str, str], side: int, rows: CameraMatches) -> PairTerm:
     """The features of one side with their surfaces, predicted in the other camera."""
     a, b = (rig.cameras[name] for name in names)
     rows = rows.select(np.isfinite(rows.planes_lidar_per_m[:, side, 0]))
@@ -198,15 +198,11 @@ def _term_of_side(
     rows = rows.select(ahead)
     pixels = rows.pixels_px[:, 1 - side]
     block = PairBlock.of_surfaces(b.lens, rays[ahead], planes[ahead], pixels)
-    block = replace(block, loss=config.loss)
     return PairTerm(*names, block, rows.frame)
 
 
-def _epipolar_term(
-    rig: Rig, names: tuple[str, str], rows: CameraMatches, config: Config
-) -> PairTerm:
+def _epipolar_term(rig: Rig, names: tuple[str, str], rows: CameraMatches) -> PairTerm:
     rows = rows.select(np.flatnonzero(np.isnan(rows.planes_lidar_per_m[:, :, 0]).all(axis=1)))
     a, b = (rig.cameras[name] for name in names)
     block = PairBlock.epipolar(a.lens, b.lens, rows.pixels_px[:, 0], rows.pixels_px[:, 1])
-    block = replace(block, loss=config.loss)
     return PairTerm(*names, block, rows.frame)

@@ -7,7 +7,7 @@ is the minimum of Eq. 5, and the model serves for its covariance alone.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import gtsam
@@ -30,7 +30,14 @@ from calibgraph.solver.error_model import (
     relative_pose_conflict,
 )
 from calibgraph.solver.lens import lens_covariances, lens_estimates, moved_lenses, put_into
-from calibgraph.solver.pair_refinement import PairFit, fit_pairs, shared_variance_ratio
+from calibgraph.solver.pair_refinement import (
+    PairFit,
+    Places,
+    fit_pairs,
+    place_pairs,
+    shared_variance_ratio,
+)
+from calibgraph.solver.pairs import PairTerm, pair_terms
 from calibgraph.solver.places import ErrorFit
 from calibgraph.solver.sources import predict_variances, sources_by_camera, variances_by_source
 from calibgraph.solver.two_pass import Objective, Optimum, Scales, Transforms
@@ -166,17 +173,28 @@ class Solution:
         return sources_by_camera(joint, total, parts, forecast, numbers=numbers)
 
     @cached_property
+    def pair_terms(self) -> tuple[PairTerm, ...]:
+        """What cameras see in common, with surfaces as here; frames of one stop are one."""
+        if self.camera_matches is None:
+            return ()
+        frame = self.correspondences.places.merge_stationary(self.camera_matches.frame)
+        rig, matches = self.rig.moved_to(self.T_camera_lidar), self.camera_matches
+        return pair_terms(rig, replace(matches, frame=frame))
+
+    @cached_property
+    def pairs_alone(self) -> Places:
+        """Where pairs place their cameras, held near the estimate."""
+        return place_pairs(self.pair_terms, self.T_camera_lidar)
+
+    @cached_property
     def pair_fits(self) -> list[PairFit]:
         """The relative poses of pairs by images, the first camera held near its correspondences."""
         if self.alone is not None:
             return self.alone.pair_fits
-        if self.camera_matches is None:
-            return []
         count, prior = len(self.fitted.cameras), _HELD_SIGMAS**2
         joint = np.diag(np.tile(prior, count)) if self.covariance is None else self.covariance
         held = [joint[pose_rows(number), pose_rows(number)] for number in range(count)]
-        rig = self.rig.moved_to(self.T_camera_lidar)
-        return fit_pairs(rig, self.camera_matches, self.config, np.array(held))
+        return fit_pairs(self.pair_terms, self.T_camera_lidar, np.array(held), self.pairs_alone)
 
     @cached_property
     def conflicts(self) -> tuple[Conflict, ...]:

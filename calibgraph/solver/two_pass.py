@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
-from typing import Any
 
 import gtsam
 import numpy as np
@@ -173,24 +172,6 @@ class Objective:
             for name, (block, T, scale) in self.gated.items()
         }
 
-    def with_blocks(self, blocks: Mapping[str, CameraBlock]) -> Objective:
-        """The same objective with other (fewer) correspondences, and the pairs of their frames."""
-        if not self.pairs:
-            return self._with(blocks=dict(blocks))
-        frames = np.concatenate([b.frame_numbers for b in blocks.values()])
-        pairs = tuple(pair.select(np.isin(pair.frame, frames)) for pair in self.pairs)
-        return self._with(blocks=dict(blocks), pairs=pairs)
-
-    def _with(self, **fields: Any) -> Objective:
-        """With other fields, on which the terms between poses do not depend."""
-        other = replace(self, **fields)
-        other.__dict__["pose_graph"] = self.pose_graph
-        return other
-
-    def without_pairs(self) -> Objective:
-        """The same objective without what cameras see in common."""
-        return self._with(pairs=())
-
     def data_only(self) -> Objective:
         """The reprojection term alone, of the cameras that have correspondences."""
         rig = Rig(cameras={name: self.rig.cameras[name] for name in self.blocks})
@@ -314,7 +295,9 @@ class Objective:
                     camera=name,
                 )
         gated = {n: (block, T_camera_lidar[n], scales[n]) for n, block in self.blocks.items()}
-        return self.with_blocks(inliers)._with(gated=gated)
+        other = replace(self, blocks=inliers, gated=gated)
+        other.__dict__["pose_graph"] = self.pose_graph  # the same terms between poses
+        return other
 
 
 def best_start(

@@ -21,7 +21,7 @@ from calibgraph.solver.within_place import WEAK
 from calibgraph.tracking.cause import chance_limit
 from calibgraph.tracking.estimate import EpochGraph, states_places
 from calibgraph.tracking.events import Event
-from calibgraph.tracking.frame_order import StreamFrame, findings_of
+from calibgraph.tracking.frames import StreamFrame, findings_of
 from calibgraph.tracking.gate import Gated, agrees, find_outlier_frame, sums_of
 from calibgraph.tracking.noise import add_residuals, median, scale_of
 from calibgraph.tracking.state import BEND, COUNTS, HISTORY, OutlierFrame, State
@@ -176,17 +176,16 @@ def _set_aside(state: State, camera: int, own: OutlierFrame | None) -> None:
     state.count(camera, left_out=1, failed=1 if own is None else 0)
 
 
-def count_repeats(state: State, given: Correspondences, new: Correspondences) -> None:
+def count_repeats(state: State, given: Correspondences, again: Collection[int]) -> None:
     """Count the frames in a row, per camera, that repeat the one before them.
 
     Args:
         state: of the tracker.
         given: the correspondences of a frame.
-        new: those of cameras that do not repeat.
+        again: numbers of its cameras that repeat.
     """
-    if given is new and not any(state.counted(c, "repeated") for c in range(len(state.names))):
+    if not again and not state.counts[:, COUNTS.index("repeated")].any():
         return
-    again = np.setdiff1d(given.camera_index, new.camera_index)
     for number in np.unique(given.camera_index).tolist():
         camera = state.names.index(given.cameras[number])
         before = state.counted(camera, "repeated")

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,29 +19,15 @@ from calibgraph.model.summary import summarize
 from calibgraph.model.verdict import START, Check, Status, Verdict
 from calibgraph.report.as_json import finite
 from calibgraph.solver.error_model import Conflict
-from calibgraph.tracking.estimate import EpochGraph, Estimate, error_sources, pairs_that_count
+from calibgraph.tracking.estimate import Estimate
 from calibgraph.tracking.events import Event
-from calibgraph.tracking.frame_order import StreamFrame
+from calibgraph.tracking.frames import StreamFrame
 from calibgraph.tracking.noise import median
 from calibgraph.tracking.state import COUNTS, State
 from calibgraph.tracking.sums import Numbers, Sums
 from calibgraph.trust.evidence import Estimate as Checked
-from calibgraph.trust.pose_posterior import (
-    MAX_FRAMES,
-    ImagePosteriors,
-    PosePosterior,
-    group_tied,
-    measured_pairs,
-)
 from calibgraph.trust.solution_checks import check_estimate
 from calibgraph.trust.thresholds import threshold
-
-MeasureOnFrames = Callable[
-    [Sequence[int], Mapping[str, Array], Sequence[Sequence[str]]], Mapping[str, PosePosterior]
-]
-"""As ``MeasurePosteriors``, on the frames of some numbers."""
-
-NOT_COMPARED = "its images were not compared with the clouds: no frame that is at hand shows it"
 
 
 class Verdicts(Mapping[str, Verdict]):
@@ -93,34 +79,6 @@ class _Judged(NamedTuple):
 
     def counted(self, camera: int, name: str) -> int:
         return int(self.counts[camera, COUNTS.index(name)])
-
-
-def with_images(
-    state: State, estimate: Estimate, measure: MeasureOnFrames | None
-) -> tuple[Estimate, dict[str, Verdict], ImagePosteriors]:
-    """Error bars and verdicts, by the posteriors of cameras with error bars, too.
-
-    Without ``measure`` they stay as they are.
-    """
-    own = covariance_by_camera(estimate, state.names)
-    known = {name: covariance for name, covariance in own.items() if covariance is not None}
-    groups = group_tied(tuple(known), measured_pairs(pairs_that_count(state)))
-    posteriors: dict[str, PosePosterior] = {}
-    if measure is not None:
-        for frames, of_frames in groups_by_frames(state, groups).items():
-            posteriors |= measure(frames, known, of_frames)
-    images = ImagePosteriors(state.names, estimate.covariance, posteriors)
-    row, flatness, verdicts = threshold("beyond_tolerance"), images.check_flatness(), {}
-    for name, verdict in Verdicts(state, estimate).items():
-        more = []
-        if name in flatness:
-            beyond = images.probability_beyond(name, state.config.tolerance)
-            more = [flatness[name], row.check(beyond)]
-        elif measure is not None and name in known:
-            more = [Check("image evidence", "WARN", NOT_COMPARED)]
-        verdicts[name] = Verdict((*verdict.checks, *more))
-    covariance = images.widen(estimate.covariance)
-    return replace(estimate, covariance=covariance), verdicts, images
 
 
 def _verdict(state: _Judged, camera: int) -> Verdict:
@@ -213,48 +171,11 @@ def second_moments(estimate: Estimate) -> Array:
     return np.asarray(window.covariance(keys) + np.outer(away, away))
 
 
-def _frames_of(state: State, name: str) -> tuple[int, ...]:
-    """Numbers of the frames that show a camera at its present pose, as of a drift the last."""
-    camera = state.names.index(name)
-    frames = tuple(state.numbers[state.sums.frames[:, camera] > 0].tolist())
-    return frames[-MAX_FRAMES:] if state.walk[camera] else frames
-
-
-def groups_by_frames(
-    state: State, groups: Sequence[tuple[str, ...]]
-) -> dict[tuple[int, ...], list[tuple[str, ...]]]:
-    """Groups of cameras by the numbers of the kept frames that show all of a group.
-
-    For the comparison of their images with the clouds. If these are less than half of a camera's
-    own, or of those that are scored, each camera of the group is alone, with its own frames. Those
-    that no frame shows are left out.
-    """
-    found: dict[tuple[int, ...], list[tuple[str, ...]]] = {}
-    for group in groups:
-        own = [_frames_of(state, name) for name in group]
-        common = tuple(number for number in own[0] if all(number in each for each in own))
-        parts = [(common, group)]
-        if any(2 * len(common) < min(len(each), MAX_FRAMES) for each in own):
-            parts = [(each, (name,)) for each, name in zip(own, group, strict=True)]
-        for frames, part in parts:
-            if frames:
-                found.setdefault(frames, []).append(part)
-    return found
-
-
-def to_calibration(
-    state: State,
-    graph: EpochGraph,
-    estimate: Estimate,
-    measure: MeasureOnFrames | None = None,
-    *,
-    sources: bool = False,
-) -> Calibration:
+def to_calibration(state: State, estimate: Estimate) -> Calibration:
     """The present estimate as a result of the same type as a batch's."""
-    estimate, verdicts, images = with_images(state, estimate, measure)
     joint = estimate.covariance
     known = None if np.isnan(joint).any() else joint
-    mounts = None if known is None else images.widen(second_moments(estimate))
+    mounts = None if known is None else second_moments(estimate)
     rig, cameras = state.rig_at(estimate.T_camera_lidar), [*enumerate(state.names)]
     return Calibration(
         rig=rig,
@@ -262,13 +183,12 @@ def to_calibration(
         covariance=covariance_by_camera(estimate, state.names),
         joint_covariance=known,
         pair_covariance=pair_covariances(mounts, rig.T_camera_lidar),
-        camera_verdicts=verdicts,
+        camera_verdicts=dict(Verdicts(state, estimate)),
         residuals={n: recent_residuals(state, c) for c, n in cameras if state.started[c]},
         counts={name: _counts(state, camera) for camera, name in cameras},
         timings_s={},
         terms="full",
         config=state.config,
-        error_sources=error_sources(state, graph, known) if sources else {},
         moves=tuple(map(str, state.moves)),
     )
 

@@ -8,22 +8,18 @@ update eliminates the places of the open epoch and exchanges one factor of that 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import gtsam
 import numpy as np
-from scipy.linalg import block_diag
 
 from calibgraph.arrays import Array, Mask
-from calibgraph.graph.by_place import QuadraticByPlace
-from calibgraph.graph.components import VarianceComponents, least_cost_of_distortion
+from calibgraph.graph.components import VarianceComponents, VarianceRatios, least_cost_of_distortion
 from calibgraph.graph.latent_poses import LatentPoseModel
-from calibgraph.graph.objective import join, objective_graph
-from calibgraph.graph.variables import camera_key
-from calibgraph.model.error_sources import ErrorSources
+from calibgraph.graph.objective import objective_graph
 from calibgraph.model.findings import error_components
-from calibgraph.model.geometry import pose_rows, retract_all, to_T_lidar_camera
+from calibgraph.model.geometry import pose_rows, retract_all
 from calibgraph.model.rig import RelativePose
 from calibgraph.solver.components import (
     Component,
@@ -34,12 +30,6 @@ from calibgraph.solver.components import (
 )
 from calibgraph.solver.covariance import ENOUGH_FRAMES, pose_equations
 from calibgraph.solver.error_model import Conflict, relative_pose_conflict
-from calibgraph.solver.places import fit_latent_poses, start_values
-from calibgraph.solver.sources import (
-    predict_variances,
-    sources_by_camera,
-    variances_by_source,
-)
 from calibgraph.solver.within_place import (
     WEAK,
     allow_for_few_frames,
@@ -126,9 +116,7 @@ class Terms:
     robust_scale: float
 
     @staticmethod
-    def of(
-        state: State, sums: PlaceSums, rows: Numbers, spread: Spread, *, by_scatter: bool = False
-    ) -> Terms:
+    def of(state: State, sums: PlaceSums, rows: Numbers, spread: Spread) -> Terms:
         """Of some rows of the sums over all frames.
 
         Args:
@@ -136,12 +124,11 @@ class Terms:
             sums: over all frames.
             rows: of the places.
             spread: of the frames.
-            by_scatter: whether cameras are displaced by what the scatter of frames shows alone.
         """
         own, frames, findings = sums.rows[rows], sums.frames[rows], state.findings
         seen, places, prior = frames > 0, sums.places[rows], error_components()
         names, weighted = tuple(sums.names[row] for row in rows), own.reweighted + WEAK
-        stated = (0.0 if by_scatter else findings.place_variance) * spread.efficiency
+        stated = findings.place_variance * spread.efficiency
         excess = spread.excess + (stated * frames / places)[..., None, None] * np.eye(6)
         alike = np.where(seen, places, np.inf).min(axis=1)
         sizes = findings.place_rotation_rad, findings.place_translation_m
@@ -268,8 +255,12 @@ class EpochGraph:
         self.pose_graph = pose_priors(state)
         T = dict(zip(state.names, state.references, strict=True))
         self.prior = pose_equations(self.pose_graph, state.names, T)
-        self.window = Window(self.model(state, self.places, self.spread), state.references)
+        self.window = self.new_window(state)
         self._held: dict[frozenset[str], tuple[Array, Array]] = {}
+
+    def new_window(self, state: State) -> Window:
+        """What all places share, by the present ratios."""
+        return Window(self.shared_model(state, self.places, self.spread), state.references)
 
     def is_of(self, state: State) -> bool:
         """Whether the state is of the same epoch, with no change but more frames."""
@@ -308,7 +299,7 @@ class EpochGraph:
             T = self.window.T_camera_lidar(keys)
         else:
             T = retract_all(state.references, self.equation_5(sums))
-        covariance = self.window.covariance(keys) + block_diag(*state.lens_errors)
+        covariance = self.window.covariance(keys) + block_diagonal(state.lens_errors)
         few = np.repeat(sums.frames < ENOUGH_FRAMES, 6)
         covariance[few], covariance[:, few] = np.nan, np.nan
         return Estimate(T, covariance, sums, self._conflicts(state, sums), self.window)
@@ -316,13 +307,17 @@ class EpochGraph:
     def open_places(self, state: State, every: PlaceSums) -> Terms:
         """Those of the frames of the open epoch, and the last one; of a drift, all that it has."""
         names = {*state.at[state.closed :], *state.at[-1:]}
-        spread = self.spread if self._is_settled else spread_of(state, every)
         if not self._is_settled:  # that of all places changes with each frame
             self._held.clear()
             names |= {*every.names}
         found = np.flatnonzero(every.frames.any(axis=1)).tolist()
         rows = [row for row in found if every.names[row] in names]
+        spread = self.open_spread(state, every)
         return Terms.of(state, every, np.array(rows, dtype=np.int64), spread)
+
+    def open_spread(self, state: State, every: PlaceSums) -> Spread:
+        """That of all frames; of many, the open epoch hardly changes it."""
+        return self.spread if self._is_settled else spread_of(state, every)
 
     def _others(self, state: State, touched: frozenset[str]) -> tuple[Array, Array]:
         """Information and vector of the closed places but some."""
@@ -381,18 +376,13 @@ class EpochGraph:
             for place, pair in measured.items()
         }
 
-    def model(
-        self, state: State, sums: PlaceSums, spread: Spread, rows: Numbers | None = None
-    ) -> LatentPoseModel:
-        """The whole graph; without rows of places, that of what all of them share."""
-        terms = None if rows is None else Terms.of(state, sums, rows, spread)
-        findings, cameras, blocks = state.findings, state.names, {}
-        bends = state.bends.sum(axis=0)
-        sigmas, places = np.asarray(findings.bend_sigmas), 1 if terms is None else len(terms.names)
+    def shared_model(self, state: State, sums: PlaceSums, spread: Spread) -> LatentPoseModel:
+        """What all places share."""
+        findings, bends, n = state.findings, state.bends.sum(axis=0), len(state.names)
+        sigmas, shared = np.asarray(findings.bend_sigmas), state.ratios.shared
         size = len(sigmas)
-        shape = (places, len(cameras), size)
-        jacobian = np.zeros((len(cameras), 6, size))
-        shown, vector = np.zeros((*shape, size)), np.zeros(shape)
+        jacobian, shown = np.zeros((n, 6, size)), np.zeros((1, n, size, size))
+        vector = np.zeros((1, n, size))
         if any(findings.bend_sigmas):
             hessian, pulled = bends[:, :36].reshape(-1, 6, 6), bends[:, 36:54].reshape(-1, 6, size)
             jacobian = np.linalg.solve(hessian + WEAK, pulled) * sigmas
@@ -400,65 +390,33 @@ class EpochGraph:
             shown[0] = weight[:, None, None] * bends[:, 54:63].reshape(-1, size, size)
             shown[0] *= np.outer(sigmas, sigmas)
             vector[0] = weight[:, None] * bends[:, 63:] * sigmas
-        none = np.zeros((0, 6, 6))
-        for camera, name in enumerate(cameras):
-            at = np.zeros(0, np.int64) if terms is None else np.flatnonzero(terms.seen[:, camera])
-            reference = to_T_lidar_camera(state.references[camera])
-            minima = [] if terms is None else [*map(reference.retract, terms.minimum[at, camera])]
-            root = none if terms is None else terms.root[at, camera]
-            information = root @ root.swapaxes(1, 2) / spread.least[camera]
-            blocks[name] = QuadraticByPlace(at, minima, information)
-        each = np.tile(np.eye(6), (places, len(cameras), 1, 1))
+        each = np.tile(np.eye(6), (1, n, 1, 1))
         components = VarianceComponents(
             cloud=np.eye(6),
-            cloud_at_place=np.asarray(np.linalg.inv(np.eye(6) if terms is None else terms.cloud)),
+            cloud_at_place=np.eye(6),
             camera=np.eye(6),
             pairs=np.eye(6),
-            at_place=each if terms is None else terms.at_place,
-            scatter_at_place=each if rows is None else _scatter(state, sums, rows, spread),
+            at_place=each,
+            scatter_at_place=each,
             distortion_jacobian=jacobian,
             pair_distortion_jacobian=np.zeros_like(jacobian),
             distortion_information=shown,
             distortion_vector=vector,
-            distortion_weight=np.ones(shape[:2]),
-            robust_scale=np.inf if terms is None else terms.robust_scale,
+            distortion_weight=np.ones((1, n)),
         )
-        components = common_error(components, findings.rigid_sigmas, findings.camera_share)
-        shared = state.ratios.shared
-        components = replace(
-            components,
-            cloud=shared * components.cloud,
-            camera=shared * components.camera,
-            distortion_size=shared,
-        )
-        return LatentPoseModel(cameras, blocks, (), self.pose_graph, components, state.config.of)
-
-    def whole_model(self, state: State) -> LatentPoseModel:
-        """The graph whose optimum and marginal are reported, with the poses of all places."""
-        sums = self.sums + state.sums[state.closed :].total()
-        every = every_place(state, self.places, sums)
-        rows = np.flatnonzero(every.frames.any(axis=1))
-        spread = self.spread if self._is_settled else spread_of(state, every)
-        found = enumerate(state.lens_errors)
-        lens_errors = {camera: covariance for camera, covariance in found if covariance.any()}
-        return replace(self.model(state, every, spread, rows), lens_errors=lens_errors)
-
-    def equation_5_graph(self, state: State) -> gtsam.NonlinearFactorGraph:
-        """Eq. 5 of the paper: priors, and a quadratic per camera."""
-        graph, at = join(self.pose_graph), gtsam.Values()
-        sums = self.sums + state.sums[state.closed :].total()
-        for camera, hessian in enumerate(sums.hessian):
-            if hessian.any():
-                key = camera_key(camera)
-                at.insert(key, to_T_lidar_camera(state.references[camera]))
-                factor = gtsam.HessianFactor(key, hessian, -sums.gradient[camera], 0.0)
-                graph.add(gtsam.LinearContainerFactor(factor, at))
-        return graph
+        prior = common_error(components, findings.rigid_sigmas, findings.camera_share)
+        components = VarianceRatios(shared=shared).scale(prior)
+        return SharedModel(state.names, {}, (), self.pose_graph, components, state.config.of)
 
 
-def _scatter(state: State, sums: PlaceSums, rows: Numbers, spread: Spread) -> Array:
-    """(P, n, 6, 6) covariance of a camera's matches at places by the scatter of frames alone."""
-    return Terms.of(state, sums, rows, spread, by_scatter=True).at_place
+@dataclass(frozen=True, eq=False)
+class SharedModel(LatentPoseModel):
+    """What all places share, of cameras whose matches are summed up."""
+
+    @cached_property
+    def matched(self) -> list[int]:
+        """All cameras, by number."""
+        return [*range(len(self.cameras))]
 
 
 def pose_priors(state: State) -> gtsam.NonlinearFactorGraph:
@@ -519,8 +477,7 @@ def settle(state: State) -> EpochGraph:
         if ratios.is_near(state.ratios):
             break
         state.ratios = ratios
-        model = graph.model(state, graph.places, graph.spread)
-        graph.window = Window(model, state.references)
+        graph.window = graph.new_window(state)
     graph.settled = state.settled
     return graph
 
@@ -573,27 +530,3 @@ def _evidence(
         "cloud": Evidence(squared[:, 0].sum(), 6.0 * weights[:, 0].sum() - open_u.sum()),
         "cameras": Evidence(squared[:, 1:].sum(), 6.0 * present.sum() - open_v[terms.seen].sum()),
     }
-
-
-def error_sources(state: State, graph: EpochGraph, joint: Array | None) -> dict[str, ErrorSources]:
-    """Per camera, the shares of its error bar at the end of a drive.
-
-    None without error bars of all cameras, and where a camera drifts: then the graph of the places
-    is not the whole.
-
-    Args:
-        state: of the tracker.
-        graph: of its epoch.
-        joint: (6 N, 6 N) the reported covariance.
-    """
-    if joint is None or state.drifting:
-        return {}
-    model = graph.whole_model(state)
-    T = dict(zip(state.names, state.references, strict=True))
-    errors = fit_latent_poses(model, start_values(model, T))
-    if errors is None:
-        raise RuntimeError("a direction of a camera is not determined")
-    total = np.minimum(np.diag(errors.covariance), np.diag(joint))
-    parts, forecast = variances_by_source(errors), predict_variances(errors)
-    numbers = {name: number for number, name in enumerate(state.names)}
-    return sources_by_camera(joint, total, parts, forecast, numbers=numbers)

@@ -25,7 +25,7 @@ from calibgraph.model.rig import Rig
 from calibgraph.solver.matches import CameraBlock
 from calibgraph.solver.robust import ResidualScale
 from calibgraph.tracking.events import Event, Size
-from calibgraph.tracking.frame_order import StreamFrame
+from calibgraph.tracking.frames import StreamFrame
 from calibgraph.tracking.state import DriftWatch, OutlierFrame, Spread, State
 from calibgraph.tracking.sums import PlaceSums, Sums
 from factors import Lens, ProjectionBlock

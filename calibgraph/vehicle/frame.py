@@ -16,11 +16,10 @@ from scipy.spatial.transform import Rotation
 
 from calibgraph.arrays import Array
 from calibgraph.model.geometry import transform
-from calibgraph.model.rig import Vehicle
+from calibgraph.model.rig import VEHICLE_AXES, Vehicle
 from calibgraph.vehicle.start import find_upright
 from calibgraph.vehicle.travel import Travel
 
-_AXES = ("roll", "pitch", "yaw", "x", "y", "z")
 _REACH_M, _GATES_M = 12.0, (0.3, 0.15, 0.08)  # of the ground that counts; of its fits, in turn
 _LEAST_INSTANTS, _LEAST_POINTS = 3, 100
 _TOLD = np.radians(0.1)  # an axis is known by travel if its sigma is below
@@ -76,7 +75,7 @@ def find_vehicle(
         sigmas = np.maximum(information**-0.5, _LEAST_SIGMA)
     notes = [
         f"the recording cannot tell {axis} of {stated.frame}: {_TO_DO[axis]}"
-        for axis, sigma in zip(_AXES, sigmas, strict=True)
+        for axis, sigma in zip(VEHICLE_AXES, sigmas, strict=True)
         if np.isinf(sigma)
     ]
     known = {

@@ -5,7 +5,9 @@ place p the LiDARs stand at theta + u_p, u_p ~ N(0, D): what a place does to all
 such as points of other times. With H_p, g_p of a place and S_p, the scatter of its cells'
 gradients, it has the information I_p = H_p S_p^-1 H_p about theta + u_p, and u_p is eliminated as
 a camera's places are: the sum of I_p - I_p (I_p + D^-1)^-1 I_p is the information about theta. The
-sizes in D are REML estimates (Schall), about a prior.
+sizes in D are REML estimates (Schall), about a prior. Errors over their own estimated size scatter
+more than over the true one, (1 + 2 f / (f + f_0)^2) with f degrees of freedom and f_0 of the prior:
+the covariance is wider by that.
 """
 
 from __future__ import annotations
@@ -97,7 +99,7 @@ def calibrate_lidars(clouds: Clouds, T_base_lidar: Mapping[str, Array], *, base:
     T = np.array([np.eye(4), *(np.asarray(T_base_lidar[name], np.float64) for name in names[1:])])
     T, _ = refine_poses(planes, T, names)
     places = [_at_place([of[i : i + 1] for of in planes], T, names) for i in range(len(planes[0]))]
-    step, joint, ratios = _over_places(places)
+    step, joint, ratios = combine_places(places)
     T = _moved(T, step)
     near, on = count_matched(planes, T)
     rows = [slice(6 * row, 6 * row + 6) for row in range(len(names) - 1)]
@@ -296,7 +298,7 @@ def _steps_between(T_base_lidar: Array, others: Array) -> Array:
     return np.column_stack([Rotation.from_matrix(turns).as_rotvec(), shifts]).ravel()
 
 
-def _over_places(
+def combine_places(
     places: Sequence[tuple[Array, Array]],
 ) -> tuple[Array, Array, tuple[float, float]]:
     """(d,) step to the optimum over places, its (d, d) covariance, and the ratios of D."""
@@ -316,11 +318,14 @@ def _over_places(
         step = joint @ vector
         apart = (at_place @ (vectors - informations @ step)[:, :, None])[:, :, 0]
         open_ = np.einsum("pii->pi", at_place + gain @ joint @ gain.transpose(0, 2, 1))
-        before, ratios = ratios, np.array([
-            (_PLACE_DOF + float((apart[:, own] ** 2 / prior[own]).sum()))
-            / (_PLACE_DOF + float((1.0 - open_[:, own] / variance[own]).sum()))
-            for own in (is_turn, ~is_turn)
-        ])  # fmt: skip
+        squares, freedom = (
+            np.array([of[:, is_turn].sum(), of[:, ~is_turn].sum()])
+            for of in (apart**2 / prior, 1.0 - open_ / variance)
+        )
+        before, ratios = ratios, (_PLACE_DOF + squares) / (_PLACE_DOF + freedom)
         if np.abs(np.log(ratios / before)).max() < _SETTLED:
             break
+    few = np.sqrt(1.0 + 2.0 * freedom / (_PLACE_DOF + freedom) ** 2)
+    wider = np.where(is_turn, *few)
+    joint = joint * np.outer(wider, wider)
     return step, (joint + joint.T) / 2, (float(ratios[0]), float(ratios[1]))

@@ -28,6 +28,7 @@ MOST_INSTANTS = 20
 
 _LOOSE = 0.3  # sigma of an axis over that of the guess: planes hardly determine it
 _OPEN = 0.98  # probability of an error by a bar alone: what is open is not known to be wrong
+_EITHER = 0.5  # the same, where another pose fits as well
 _AXES = ("roll x", "pitch y", "yaw z", "x", "y", "z")
 _log = logging.getLogger(__name__)
 
@@ -83,12 +84,12 @@ def calibrate_rig_lidars(
     known = {name: T for name, T in guess.items() if T is not None}
     progress("locating LiDARs", 0, 1)
     try:
-        start = locate_lidars(clouds, guess, base=rig.lidar)
+        start, doubts = locate_lidars(clouds, guess, base=rig.lidar)
     except CalibrationError as error:
         if len(known) < len(guess):
             raise
         warnings.append(f"{error}; begun from the guess")
-        start = known
+        start, doubts = known, {}
     progress("calibrating LiDARs", 0, 1)
     poses = calibrate_lidars(clouds, start, base=rig.lidar)
     lidars = {rig.lidar: Lidar()} | {
@@ -106,7 +107,10 @@ def calibrate_rig_lidars(
         {name: lidars[name] for name in rig.lidars or {}},
         vehicle,
         poses,
-        {name: judge_lidar(poses, name, config.tolerance) for name in rig.other_lidars},
+        {
+            name: judge_lidar(poses, name, config.tolerance, doubt=doubts.get(name, ""))
+            for name in rig.other_lidars
+        },
         tuple(warnings),
     )
 
@@ -145,10 +149,13 @@ def _complete(frames: Sequence[Frame], rig: Rig) -> list[Frame]:
     return complete
 
 
-def judge_lidar(poses: LidarPoses, name: str, tolerance: tuple[float, float]) -> Verdict:
+def judge_lidar(
+    poses: LidarPoses, name: str, tolerance: tuple[float, float], *, doubt: str = ""
+) -> Verdict:
     """The verdict of one LiDAR for a tolerance [deg, cm].
 
-    What counts data is in the error bar, and no sign of an error.
+    What counts data is in the error bar, and no sign of an error. The doubt is about the start:
+    where another pose fits as well.
     """
     covariance = poses.covariance[name]
     checks = [
@@ -160,6 +167,9 @@ def judge_lidar(poses: LidarPoses, name: str, tolerance: tuple[float, float]) ->
         apart = float(np.sqrt(max(poses.place_ratios)))
         checks.append(threshold("lidar_places").check(apart))
     beyond = min(probability_beyond(covariance, tolerance), _OPEN)
+    if doubt:
+        checks.append(Check("another placement", "WARN", doubt, kind="lidar_start"))
+        beyond = max(beyond, _EITHER)
     signs = [check for check in checks if (check.kind or check.name) not in ABOUT_THE_DATA]
     return replace(judge(signs, beyond, tolerance, TABLES), checks=tuple(checks))
 

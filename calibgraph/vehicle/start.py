@@ -3,7 +3,8 @@
 The ground gives the direction up and the height of each LiDAR. Then two clouds differ by a heading
 and a shift, of which all are tried: the images of upright things from above are correlated, heading
 by heading. The likeliest are refined by planes, and the one whose upright planes agree best is
-taken.
+taken. Where another one agrees as well, as in a room that looks alike from both ends, a line states
+that.
 """
 
 from __future__ import annotations
@@ -28,14 +29,20 @@ _FROM_M, _TO_M = 0.4, 6.0  # over the ground: what is upright
 _STEP_DEG = 3.0  # between headings
 _APART_M = 12.0  # of two LiDARs of one vehicle
 _NEAR_DEG, _NEAR_M = 35.0, 2.5  # of a guess
-_TRIED = 6  # placements that are refined
+_TRIED, _PER_HEADING = 8, 3  # placements that are refined; of them with a similar heading
 _INSTANTS = 3  # that are looked at
 _LEAST_ON, _LEAST_SHARE = 15, 0.7
 """Upright planes that lie on another's, and their share of those near one. Of two vehicles (carla,
 opencalib) right placements have 18 and more, 0.75 and more, but for one of 6; clouds of two places
 have up to 11, and with more than 5 up to 1.0."""
 _ROUNDS, _MOST_PLANES = 9, 2000  # of refining
-_PEAK_M = 1.5  # about one that has been tried
+_PEAK_DEG, _PEAK_M, _BAND_DEG = 10.0, 1.5, 15.0  # about one that has been tried; a similar heading
+_OFF = (
+    4  # power of the share: a plane beside another's is rarer where poses are right than one on it
+)
+_AS_GOOD = 0.85  # of the best score
+_OTHER_DEG, _OTHER_M = 5.0, 0.5  # from which a placement is another one
+_GROUND = 0.3  # of the points on the plane that holds most; planes that are neither have up to 0.15
 _UPS = np.array([up for up in product((-1.0, 0.0, 1.0), repeat=3) if any(up)])
 
 
@@ -58,6 +65,10 @@ class _Placement(NamedTuple):
     def is_sure(self) -> bool:
         return self.on >= _LEAST_ON and self.share >= _LEAST_SHARE
 
+    @property
+    def score(self) -> float:
+        return self.on * self.share**_OFF
+
 
 _Placed = Mapping[str, tuple[_Seen, Array]]
 """LiDARs whose (4, 4) T_base_lidar is known."""
@@ -65,8 +76,8 @@ _Placed = Mapping[str, tuple[_Seen, Array]]
 
 def locate_lidars(
     clouds: Clouds, guess: Mapping[str, Array | None], *, base: str
-) -> dict[str, Array]:
-    """Rough (4, 4) T_base_lidar of each LiDAR but the base.
+) -> tuple[dict[str, Array], dict[str, str]]:
+    """Rough (4, 4) T_base_lidar of each LiDAR but the base; a line on each that fits twice.
 
     Args:
         clouds: as of :func:`calibgraph.vehicle.lidars.calibrate_lidars`.
@@ -79,15 +90,17 @@ def locate_lidars(
     chosen = np.unique(np.linspace(0, len(clouds[base]) - 1, _INSTANTS).round().astype(int))
     seen = {name: _look(name, [of[i] for i in chosen]) for name, of in clouds.items()}
     placed, left = {base: (seen[base], np.eye(4))}, [name for name in clouds if name != base]
+    doubts = dict[str, str]()
     while left:
         found = {}
         for name in left:
-            starts = _placements(seen[name], placed, seen[base].T_up_lidar, guess[name])
-            found[name] = _best(seen[name], placed, starts, seen[base].T_up_lidar[2, :3])
+            tried = _placements(seen[name], placed, seen[base].T_up_lidar, guess[name])
+            found[name], doubts[name] = _best(tried, guess[name])
         _require_one(found, [*placed])
         placed |= {name: (seen[name], of.T) for name, of in found.items() if of.is_sure}
         left = [name for name in left if name not in placed]
-    return {name: T for name, (_, T) in placed.items() if name != base}
+    poses = {name: T for name, (_, T) in placed.items() if name != base}
+    return poses, {name: doubts[name] for name in poses if doubts[name]}
 
 
 def _require_one(found: Mapping[str, _Placement], placed: Sequence[str]) -> None:
@@ -110,12 +123,17 @@ def _look(name: str, clouds: Sequence[Array]) -> _Seen:
 
 
 def find_upright(name: str, clouds: Sequence[Array]) -> Array:
-    """(4, 4) T_up_lidar: z up, 0 on the ground; by all instants together."""
+    """(4, 4) T_up_lidar: z up, 0 on the ground; by all instants together.
+
+    In a narrow street a wall may hold more points than the ground, but the ground is nearer.
+    """
     cloud = np.concatenate(clouds)
-    share, height_m, normal = max(
-        (find_ground(cloud, up / np.linalg.norm(up)) for up in _UPS), key=lambda ground: ground[0]
+    grounds = [find_ground(cloud, up / np.linalg.norm(up)) for up in _UPS]
+    most = max(share for share, _, _ in grounds)
+    _, height_m, normal = min(
+        (ground for ground in grounds if ground[0] >= _GROUND * most), key=lambda ground: ground[1]
     )
-    if share == 0.0:
+    if most == 0.0:
         raise CalibrationError(
             f"LiDAR {name!r} sees no ground, by which its placement is found; write its "
             "T_base_lidar into rig.yaml"
@@ -126,25 +144,45 @@ def find_upright(name: str, clouds: Sequence[Array]) -> Array:
     return T
 
 
-def _placements(own: _Seen, placed: _Placed, T_up_base: Array, guess: Array | None) -> list[Array]:
-    """Likely (4, 4) T_base_lidar: the guess, and by the images from above."""
+def _placements(
+    own: _Seen, placed: _Placed, T_up_base: Array, guess: Array | None
+) -> list[_Placement]:
+    """Refined placements that differ: of the guess, and of peaks of the images from above."""
     headings, offsets, score = _correlate(own, placed, T_up_base)
-    starts = [] if guess is None else [guess]
-    if guess is not None:  # only near it
-        T = T_up_base @ guess @ invert(own.T_up_lidar)
+
+    def away(T_base_lidar: Array) -> tuple[Array, Array]:
+        """(h,) [deg], (c, c) [m] from the heading and the position of a placement."""
+        T = T_up_base @ T_base_lidar @ invert(own.T_up_lidar)
         turned = headings - np.degrees(np.arctan2(T[1, 0], T[0, 0]))
-        score[np.abs((turned + 180.0) % 360.0 - 180.0) > _NEAR_DEG] = -np.inf
-        at = (T_up_base @ guess)[:2, 3]
-        score[:, np.linalg.norm(offsets - at, axis=-1) > _NEAR_M] = -np.inf
-    while len(starts) < _TRIED and np.isfinite(score.max()):
+        at = np.linalg.norm(offsets - T[:2, 3], axis=-1)
+        return np.abs((turned + 180.0) % 360.0 - 180.0), at
+
+    if guess is not None:  # only near it
+        turned, shifted = away(guess)
+        score[turned > _NEAR_DEG] = -np.inf
+        score[:, shifted > _NEAR_M] = -np.inf
+    known = [
+        join_planes([of.planes[i].moved(T) for of, T in placed.values()])
+        for i in range(len(own.planes))
+    ]
+    found, similar = list[_Placement](), np.zeros(len(headings))
+    for number in range(_TRIED):
         turn, i, j = np.unravel_index(int(score.argmax()), score.shape)
         T = _turn(headings[turn])
         T[:2, 3] = offsets[i, j]
-        starts.append(invert(T_up_base) @ T @ own.T_up_lidar)
-        apart = np.abs((headings - headings[turn] + 180.0) % 360.0 - 180.0)
-        near = np.linalg.norm(offsets - offsets[i, j], axis=-1) <= _PEAK_M
-        score[np.ix_(apart <= 2 * _STEP_DEG, near.any(axis=1), near.any(axis=0))] = -np.inf
-    return starts
+        start = invert(T_up_base) @ T @ own.T_up_lidar
+        if guess is not None and number == 0:
+            start = guess
+        elif np.isinf(score[turn, i, j]):
+            break
+        refined = _refined(known, own.planes, start, T_up_base[2, :3])
+        found += [each for each in refined if guess is None or _is_near(each.T, guess)]
+        for T in (start, *(each.T for each in refined)):
+            turned, shifted = away(T)
+            score[(turned <= _PEAK_DEG)[:, None, None] & (shifted <= _PEAK_M)] = -np.inf
+        similar += away(start)[0] <= _BAND_DEG
+        score[similar >= _PER_HEADING] = -np.inf
+    return found
 
 
 def _correlate(own: _Seen, placed: _Placed, T_up_base: Array) -> tuple[Array, Array, Array]:
@@ -196,18 +234,47 @@ def _from_above(points_m: Array) -> Array:
     return np.asarray(image / max(float(np.linalg.norm(image)), float(np.finfo(float).tiny)))
 
 
-def _best(own: _Seen, placed: _Placed, starts: Sequence[Array], up: Array) -> _Placement:
-    """Of refined starts the one whose upright planes agree best; ``up`` in the base frame."""
-    known = [
-        join_planes([of.planes[i].moved(T) for of, T in placed.values()])
-        for i in range(len(own.planes))
-    ]
-    both, results = [known, own.planes], [_Placement(0, 0.0, np.eye(4))]
-    for start in starts:
-        try:
-            T, _ = refine_poses(both, np.array([np.eye(4), start]), ("base", ""), rounds=_ROUNDS)
-        except CalibrationError:  # hardly anything in common there
-            continue
-        near, on = (float(count[1]) for count in count_matched(both, T, up=up))
-        results.append(_Placement(int(on), on / max(near, 1.0), T[1]))
-    return max(results, key=lambda found: found.on * found.share)
+def _refined(
+    known: Sequence[Planes], own: Sequence[Planes], start: Array, up: Array
+) -> list[_Placement]:
+    """Where a start ends, and how its upright planes agree there; ``up`` in the base frame."""
+    try:
+        T, _ = refine_poses(
+            [known, own], np.array([np.eye(4), start]), ("base", ""), rounds=_ROUNDS
+        )
+    except CalibrationError:  # hardly anything in common there
+        return []
+    near, on = (float(count[1]) for count in count_matched([known, own], T, up=up))
+    return [_Placement(int(on), on / max(near, 1.0), T[1])]
+
+
+def _best(tried: Sequence[_Placement], guess: Array | None) -> tuple[_Placement, str]:
+    """The placement whose planes agree best, and a line if another one is as good.
+
+    Of such that are as good it is the one nearest to the guess.
+    """
+    best = max(tried, key=lambda each: each.score, default=_Placement(0, 0.0, np.eye(4)))
+    as_good = [each for each in tried if each.score >= _AS_GOOD * best.score]
+    if guess is not None and any(_is_other(each.T, best.T) for each in as_good):
+        best = min(as_good, key=lambda each: np.linalg.norm(each.T[:3, 3] - guess[:3, 3]))
+    others = [each for each in as_good if _is_other(each.T, best.T)]
+    if not others:
+        return best, ""
+    degrees, metres = max(_apart(each.T, best.T) for each in others)
+    return best, f"turned by {degrees:.0f} deg and moved by {metres:.1f} m it fits as well"
+
+
+def _apart(T_base_lidar: Array, other: Array) -> tuple[float, float]:
+    """How far apart two placements are [deg, m]."""
+    turn = Rotation.from_matrix(T_base_lidar[:3, :3] @ other[:3, :3].T).magnitude()
+    return float(np.degrees(turn)), float(np.linalg.norm(T_base_lidar[:3, 3] - other[:3, 3]))
+
+
+def _is_other(T_base_lidar: Array, other: Array) -> bool:
+    degrees, metres = _apart(T_base_lidar, other)
+    return degrees > _OTHER_DEG or metres > _OTHER_M
+
+
+def _is_near(T_base_lidar: Array, guess: Array) -> bool:
+    degrees, metres = _apart(T_base_lidar, guess)
+    return degrees <= _NEAR_DEG and metres <= _NEAR_M

@@ -28,6 +28,8 @@ from calibgraph.vehicle.planes import Planes
 CELL_M = 4.0
 """Edge of the cells within which residuals err alike: the independent units."""
 
+_CELL_NUMBERS = np.array([1, 2**12, 2**24])  # of steps along x, y, z: 2,048 either way
+_PLACE_NUMBER = 2**40
 _RELIABLE = 0.8  # of H over H without errors of normals: at places that determine all, over 0.9
 _DETERMINED = 0.1  # of the same, over all pairs
 
@@ -60,13 +62,11 @@ class Sums:
     """H and g of cells by the steps of all LiDARs but the base, in units of residuals.
 
     Attributes:
-        place: (r,) its number.
         hessian: (r, d, d), positive only in sum.
         gradient: (r, d).
         metric: (d, d) the sum of H without errors of normals.
     """
 
-    place: NDArray[np.int64]
     hessian: Array
     gradient: Array
     metric: Array
@@ -91,10 +91,10 @@ def sum_up(matches: Sequence[Matches], T_base_lidar: Array, scale_m: float) -> S
         by = kept @ by
         rows.append((np.full(len(cells), place), cells, by.T @ hessian @ by, gradient @ by))
     places, cells, hessians, gradients = map(np.concatenate, zip(*rows, strict=True))
-    named, row = np.unique(np.column_stack([places, cells]), axis=0, return_inverse=True)
+    row = np.unique(places * _PLACE_NUMBER + cells, return_inverse=True)[1]
     hessian, gradient = _added(row.ravel(), hessians), _added(row.ravel(), gradients)
     free = slice(6, None)  # but the base
-    return Sums(named[:, 0], hessian[:, free, free], gradient[:, free], metric[free, free])
+    return Sums(hessian[:, free, free], gradient[:, free], metric[free, free])
 
 
 def _twists_by_steps(T_base_lidar: Array) -> Array:
@@ -121,7 +121,7 @@ def _cross_matrix(vectors: Array) -> Array:
 def _of_pair(
     matches: Sequence[Matches], one: int, scale_m: float
 ) -> tuple[NDArray[np.int64], Array, Array, Array]:
-    """Cells (c, 3), their H (c, 6, 6) and g (c, 6) by the twist of one against the other.
+    """Numbers of cells (c,), their H (c, 6, 6) and g (c, 6) by the twist of one against the other.
 
     And H of all, (6, 6), as if normals did not err.
     """
@@ -142,8 +142,8 @@ def _of_pair(
         gradient = 0.5 * (b * by_others[:, None] + a * by_own[:, None])
         hessians.append(weight[:, None, None] * hessian)
         gradients.append(weight[:, None] * gradient * (1.0 if own.one == one else -1.0))
-        cells.append(np.floor(points / CELL_M).astype(np.int64))
-    named, row = np.unique(np.concatenate(cells), axis=0, return_inverse=True)
+        cells.append(np.floor(points / CELL_M).astype(np.int64) @ _CELL_NUMBERS)
+    named, row = np.unique(np.concatenate(cells), return_inverse=True)
     hessian, gradient = np.concatenate(hessians), np.concatenate(gradients)
     return named, _added(row.ravel(), hessian), _added(row.ravel(), gradient), whole
 

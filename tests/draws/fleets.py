@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,9 @@ from pyarrow import csv
 
 from calibgraph import MatcherErrors, perturb, simulate_correspondences
 from calibgraph.arrays import Array
+from calibgraph.child_process import Outcome
+from calibgraph.fleet.job import Limits, execute
+from calibgraph.fleet.manifest import Job
 from calibgraph.model.geometry import relative_transform, retract_all
 from calibgraph.simulation.rigs import rig_of
 
@@ -151,3 +155,9 @@ def write_fleet(folder: Path, vehicles: int, *, frames: int = 6, matches: int = 
     }
     csv.write_csv(pa.table(columns), folder / "fleet.csv")
     return folder / "fleet.csv"
+
+
+def run_here(job: Job, limits: Limits, _: str) -> Outcome:
+    """Run a job in this process, in place of ``run_job``."""
+    with TemporaryDirectory() as folder:
+        return execute(job, limits, Path(folder))

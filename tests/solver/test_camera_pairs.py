@@ -101,7 +101,7 @@ def test_the_relative_pose_is_found_without_noise(
     a, b = list(truth.cameras)[:2]
     moved = perturb(truth, rotation_deg=1.0, translation_m=0.1, seed=1)
     guess = truth.moved_to({b: moved.T_camera_lidar[b]})
-    terms = pair_terms(guess, table, Config())
+    terms = pair_terms(guess, table)
     assert {(term.a, term.b) for term in terms} == {(a, b), (b, a)}
     degrees, centimetres = pair_error(solve_pair(guess, terms, 1e-7), truth)
     assert degrees < 1e-5 and centimetres < 1e-4
@@ -111,7 +111,7 @@ def test_a_wrong_pose_of_a_does_not_spoil_the_relative_pose(pair: Rig) -> None:
     """A is 1.5 deg and 30 cm off, and only loosely held there."""
     table = simulated_pairs(pair)
     guess = perturb(pair, rotation_deg=1.5, translation_m=0.3, seed=3)
-    terms = pair_terms(guess, table, Config())
+    terms = pair_terms(guess, table)
     degrees, centimetres = pair_error(solve_pair(guess, terms, 0.03), pair)
     assert degrees < 0.02 and centimetres < 0.5
 
@@ -120,7 +120,7 @@ def test_features_without_a_surface_give_the_direction(pair: Rig) -> None:
     """Epipolar residuals determine all but the length of the baseline."""
     table = simulated_pairs(pair)
     bare = table.with_planes(np.full_like(table.planes_lidar_per_m, np.nan))
-    terms = pair_terms(pair, bare, Config())
+    terms = pair_terms(pair, bare)
     assert [term.block.axes for term in terms] == [1]
     guess = pair.moved_to({"right": perturb(pair, rotation_deg=0.5, translation_m=0.05, seed=2)
                            .T_camera_lidar["right"]})  # fmt: skip
@@ -141,7 +141,7 @@ def test_pairs_with_too_few_matches_have_no_term(pair: Rig) -> None:
 def test_sigma_and_gate_fit_the_noise(pair: Rig) -> None:
     """0.3 px in each image; a tenth of outliers, most of them beyond the gate."""
     table = simulated_pairs(pair, outliers=0.1)
-    term = pair_terms(pair, table, Config())[0]
+    term = pair_terms(pair, table)[0]
     sigma = term.sigma_px(pair.T_camera_lidar)
     # Both images' noise adds up; the disparity's also by way of the point on an oblique plane.
     assert 0.3 * np.sqrt(2) * 0.8 < sigma < 0.3 * np.sqrt(2) * 1.3

@@ -30,7 +30,13 @@ from calibgraph.solver.covariance import with_pseudo_frames
 from calibgraph.solver.error_model import fit_errors
 from calibgraph.solver.joint import solve_joint
 from calibgraph.solver.matches import camera_blocks
-from calibgraph.solver.pair_refinement import PairFit, fit_pairs, shared_variance_ratio
+from calibgraph.solver.pair_refinement import (
+    PairFit,
+    fit_pairs,
+    place_pairs,
+    shared_variance_ratio,
+)
+from calibgraph.solver.pairs import pair_terms
 from calibgraph.solver.places import ErrorFit
 from calibgraph.solver.robust import ResidualScale
 from calibgraph.solver.sources import variances_by_source
@@ -247,7 +253,9 @@ def test_its_size_is_found_from_what_cameras_see_in_common(mixed_rig: Rig, size:
 def fits_of(rig: Rig) -> list[PairFit]:
     """Where exact images place the cameras."""
     held = np.array([np.diag(EACH)] * len(rig.cameras))
-    return fit_pairs(rig, simulated_pairs(rig), Config(), held)
+    terms = pair_terms(rig, simulated_pairs(rig))
+    T = rig.T_camera_lidar
+    return fit_pairs(terms, T, held, place_pairs(terms, T))
 
 
 def test_it_is_never_taken_for_less_than_usual_and_as_usual_without_tied_cameras(pair: Rig) -> None:

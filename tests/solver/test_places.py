@@ -182,7 +182,7 @@ def with_correlations(model: LatentPoseModel) -> LatentPoseModel:
 def test_a_pair_of_which_the_gate_has_left_nothing_takes_no_part(pair: Rig) -> None:
     table, matches = table_of(pair, 6, False, []), simulated_pairs(pair, count=40)
     solution = solve_joint(pair, table, Config(learnt_weights=False), camera_matches=matches)
-    term = pair_terms(pair, matches, Config())[0].with_sigma(1.0)
+    term = pair_terms(pair, matches)[0].with_sigma(1.0)
     empty = term.select(np.zeros(len(term.frame), np.bool_))
     more = replace(solution.inliers, pairs=(*solution.inliers.pairs, empty))
     found, expected = (

@@ -133,6 +133,26 @@ def test_transforms_of_lidars_and_vehicle_are_exported(result: Calibration, tmp_
 
 
 @pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (None, "its roll, pitch, yaw, x, y, z are unknown"),
+        ({"T_vehicle_lidar": None}, "its roll, pitch, yaw, x, y, z are unknown"),
+        ({"translation_sigma_m": (np.inf, 0.1, 0.1)}, "top in base_link is left out, as its x are"),
+    ],
+)
+@pytest.mark.parametrize("format", ["autoware", "urdf"])
+def test_a_pose_in_the_vehicle_that_is_not_written_is_named(
+    format: str, change: dict | None, named: str, result: Calibration, tmp_path: Path, call: Call
+):
+    vehicle = None if change is None else result.rig.vehicle.model_copy(update=change)
+    folder = tmp_path / "out"
+    replace(result, rig=result.rig.model_copy(update={"vehicle": vehicle})).save(folder)
+    code, _, err = call("export", folder, "--format", format, "--out", tmp_path / "kit")
+    assert code == 0 and named in err and not (tmp_path / "sensors_calibration.yaml").exists()
+    assert ("sensors_calibration.yaml is not written" in err) == (format == "autoware")
+
+
+@pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"lidars": None}, "cameras: the rig has none; name one, or at least two lidars"),

@@ -4,6 +4,7 @@ Lenses that a format cannot carry are refused, not rounded.
 """
 
 import json
+import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -32,9 +33,11 @@ from calibgraph.model.geometry import (
     relative_transform,
     ros_pose_covariance,
 )
-from calibgraph.model.rig import Camera, Mount, Rig, rigid_transform
+from calibgraph.model.rig import Camera, Mount, Rig, Vehicle, rigid_transform
 from calibgraph.model.verdict import rig_verdict
 from calibgraph.yaml_text import yaml_text
+
+_log = logging.getLogger(__name__)
 
 EXPORT_MARK = "calibgraph export"
 CAMERA_FRAME = "{camera}_optical_frame"
@@ -80,9 +83,21 @@ class RigExport:
     def vehicle_link(self) -> Link | None:
         """The base LiDAR in the vehicle's frame; None if an axis of it is unknown."""
         vehicle = self.rig.vehicle
-        if vehicle is None or vehicle.T_vehicle_lidar is None or np.isinf(vehicle.sigmas).any():
+        if vehicle is None or vehicle.T_vehicle_lidar is None or vehicle.unknown_axes:
             return None
         return Link(vehicle.frame, self.lidar_frame, vehicle.T_vehicle_lidar)
+
+    @property
+    def left_out(self) -> str:
+        """A line, if a rig of several LiDARs has no pose of the base in the vehicle."""
+        if self.vehicle_link is not None or not self.lidars:
+            return ""
+        vehicle = self.rig.vehicle or Vehicle()
+        return (
+            f"the pose of {self.lidar_frame} in {vehicle.frame} is left out, as its "
+            f"{', '.join(vehicle.unknown_axes)} are unknown: state what you know of them as "
+            "T_vehicle_lidar with sigmas, under vehicle in rig.yaml, and calibrate again"
+        )
 
     def link(self, name: str) -> tuple[str, str, Array]:
         """Parent, child and (4, 4) T_parent_child of the transform that a calibration changes."""
@@ -534,7 +549,8 @@ def export_calibration(  # noqa: PLR0913
 
     Returns:
         The files: one; for ``camera_info`` one of each camera; for ``autoware``
-        sensors_calibration.yaml beside it, if the rig has the LiDAR in the vehicle.
+        sensors_calibration.yaml beside it, if the rig has the LiDAR in the vehicle; if not, a line
+        is logged that names why.
 
     Raises:
         CalibrationError: if the verdict is FAIL, or the format or the file cannot hold it.
@@ -611,6 +627,9 @@ def _loaded(path: Path | str) -> Calibration | Rig:
 def _write(export: RigExport, path: Path, format: str, *, force: bool) -> tuple[Path, ...]:
     """Write all files or, if one may not be replaced, none."""
     written = WRITERS[format](export)
+    if format in TRANSFORMS and export.left_out:
+        not_written = f"; {_KIT_IN_VEHICLE} is not written" if format == _WITH_BASE else ""
+        _log.warning(export.left_out + not_written)
     contents = {path: written} if isinstance(written, str) else {
         path / name: content for name, content in written.items()
     }  # fmt: skip
