@@ -128,8 +128,7 @@ def doctor(
 ) -> None:
     """Examine a dataset before it is calibrated: what is there, what to fix; exit 1 if anything."""
     from calibgraph.doctor import diagnose
-    from calibgraph.file_sets import require_own_folder
-    from calibgraph.files import write_text
+    from calibgraph.files import require_own_folder, write_text
     from calibgraph.io.rigs import load_rig
 
     if out is not None:

@@ -13,8 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from calibgraph.arrays import Array
 from calibgraph.errors import DatasetError
-from calibgraph.file_sets import written_together
-from calibgraph.files import write_text
+from calibgraph.files import write_text, written_together
 from calibgraph.io.dataset import Dataset
 from calibgraph.io.formats import EXPORT_FORMATS
 from calibgraph.io.frame import Frame, frame_of_entry, hash_source
