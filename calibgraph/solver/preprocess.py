@@ -343,12 +343,6 @@ def _first_of_same_content(hashes: Hashes, counts: Numbers) -> Numbers:
     return found
 
 
-def hash_numbers(points_lidar_m: Array) -> list[int]:
-    """:func:`point_hashes` as numbers: a set of some hundred is faster than arrays."""
-    numbers: list[int] = point_hashes(points_lidar_m).tolist()
-    return numbers
-
-
 def point_hashes(points: Array) -> Hashes:
     """(n,) uint64 of the bits of each point of (n, 2) or (n, 3)."""
     mixed = np.zeros(len(points), dtype=np.uint64)
