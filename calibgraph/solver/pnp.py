@@ -226,7 +226,8 @@ def pose_near_guess(
     block = ProjectionBlock(camera.lens, matches.points_lidar_m, matches.pixels_px)
     wide = block.rescale(scale=_WIDE * config.pnp_threshold_px)
     start, runs = camera.T_camera_lidar[None], np.array([[0, len(block)]])
-    return fit_frames(wide, runs, start, tolerance=COARSE)[0][0]
+    T_camera_lidar, *_ = fit_frames(wide, runs, start, tolerance=COARSE)
+    return np.asarray(T_camera_lidar[0])
 
 
 def view_plane(camera: Camera, pixels_px: Array) -> tuple[Array, Array]:
