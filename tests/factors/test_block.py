@@ -155,7 +155,9 @@ def test_far_residuals_do_not_leave_the_range_of_a_float() -> None:
     """The sum of logarithms is taken as that of a product, of weights down to 1e-20 each here."""
     points = np.tile([0.0, 0.0, 1.0], (1001, 1))
     pixels = np.tile([1e6, 0.0], (1001, 1))
-    block = ProjectionBlock(Lens.pinhole(fx=1.0, fy=1.0, cx=0, cy=0), points, pixels, scale=1e-4)
+    block = ProjectionBlock(
+        Lens.of("pinhole", fx=1.0, fy=1.0, cx=0, cy=0), points, pixels, scale=1e-4
+    )
     expected = 1001 * 1e-8 * np.log1p(1e20)
     assert float(block.sums(gtsam.Pose3()).cost) == pytest.approx(expected, rel=1e-12)
 
