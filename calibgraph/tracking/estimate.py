@@ -36,8 +36,8 @@ from calibgraph.solver.within_place import (
     relative_covariance,
     split_excess,
 )
+from calibgraph.tracking.cause import sure_inflation
 from calibgraph.tracking.eliminate import Eliminated, block_diagonal, eliminate
-from calibgraph.tracking.noise import sure_inflation
 from calibgraph.tracking.state import Spread, State, rows_of
 from calibgraph.tracking.sums import Numbers, PlaceSums, Sums
 from calibgraph.tracking.window import Window
@@ -367,7 +367,7 @@ class EpochGraph:
 
     def shared_model(self, state: State, sums: PlaceSums, spread: Spread) -> LatentPoseModel:
         """What all places share."""
-        findings, bends, n = state.findings, state.bends.sum(axis=0), len(state.names)
+        findings, bends, n = state.findings, state.bends, len(state.names)
         sigmas, shared = np.asarray(findings.bend_sigmas), state.ratios.shared
         size = len(sigmas)
         jacobian, shown, vector = np.zeros((n, 6, size)), np.zeros((size, size)), np.zeros(size)
