@@ -129,7 +129,7 @@ def test_transforms_of_lidars_and_vehicle_are_exported(result: Calibration, tmp_
         "lidars"
     ]
     with pytest.raises(RigError, match="no camera, only LiDARs"):
-        export_calibration(result, tmp_path / "calib.txt", "kitti")
+        export_calibration(result, tmp_path / "chain.yaml", "kalibr")
 
 
 @pytest.mark.parametrize(
