@@ -341,6 +341,7 @@ def npy_header(text: str) -> bytes:
 
 SHAPE = "{'descr': '<f4', 'fortran_order': False, 'shape': %s, }"
 NO_ARRAY = "cannot be read as a .npy array"
+np.savez(ARCHIVE := io.BytesIO(), CLOUD)
 REFUSED = [
     *((f"cloud.{'ply' if b'format ' in data[:30] else 'pcd'}", data, said)
       for said, data in BROKEN.items()),
@@ -359,6 +360,7 @@ REFUSED = [
     ("truncated.npy", npy(CLOUD)[:-100], "truncated.npy"),
     ("empty.npy", b"", "empty.npy"),
     ("archive.npy", b"PK\x03\x04" + bytes(64), NO_ARRAY),
+    ("arrays.npy", ARCHIVE.getvalue(), "is an archive of arrays, expected one array"),
     *(("hostile.npy", npy_header(text), NO_ARRAY) for text in (
         SHAPE % "(100000000000, 4)", SHAPE % "(-5, 4)", SHAPE % f"(1{'0' * 400}, 4)",
         SHAPE % f"{'-' * 9000}1", SHAPE % f"{'[' * 4000}{']' * 4000}", "{" * 9000)),
