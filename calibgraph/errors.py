@@ -102,11 +102,6 @@ class CorrespondenceError(CalibrationError):
         """The message for those who gave lists per camera, whose number in the table is unseen."""
         return str(self) if self.row is None else f"camera {self.camera!r}: {self._message}"
 
-    def after(self, rows: int) -> CorrespondenceError:
-        """The same error in a table with this number of rows before these."""
-        row = None if self.row is None else rows + self.row
-        return type(self)(self._message, camera=self.camera, frame=self.frame, row=row)
-
 
 class MotionError(CorrespondenceError):
     """A motion that no vehicle has: it is of another unit or order, also where it is slower."""

@@ -3,10 +3,6 @@
 import ctypes
 import math
 import mmap
-import resource
-import sys
-from contextlib import suppress
-from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -27,16 +23,6 @@ def keep_freed_memory() -> None:
     if mallopt is not None:
         for option, value in _MALLOC_OPTIONS.items():
             mallopt(option, value)
-
-
-def available_bytes() -> int:
-    """Memory that this process can still take: of the machine, and of its limits."""
-    found = [resource.getrlimit(resource.RLIMIT_AS)[0]]
-    with suppress(OSError, ValueError):
-        lines = Path("/proc/meminfo").read_text().splitlines()
-        found += [int(line.split()[1]) << 10 for line in lines if line.startswith("MemAvailable")]
-        found.append(int(Path("/sys/fs/cgroup/memory.max").read_text()))
-    return min((each for each in found if each >= 0), default=sys.maxsize)
 
 
 def mmap_zeros(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:

@@ -20,6 +20,7 @@ from calibgraph.arrays import Array
 from calibgraph.elsewhere import go_on_elsewhere
 from calibgraph.io.clouds import describe_thinned
 from calibgraph.io.dataset import Dataset, load_dataset
+from calibgraph.io.tables import load_correspondences
 from calibgraph.model.calibration import Calibration, Later
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.clock import odd_motions, unused_times
@@ -157,8 +158,7 @@ def solve(
 
     Args:
         rig: cameras with their initial guess, and independently known relative poses.
-        table: correspondences, their points in the LiDAR frame; or their file, which
-            may be larger than memory: only what the preprocessing keeps is held.
+        table: correspondences, their points in the LiDAR frame; or their file.
         config: settings; the preset ``auto`` if None.
         terms: ``full``; ``reprojection`` (lambda = mu = 0); ``priors`` (no reprojection term);
             ``stage1`` (the aggregated per-frame PnP). The rig's ``relative_poses`` are
@@ -175,6 +175,7 @@ def solve(
             and neither a relative pose nor common features that tie it to a camera that has more.
         ValueError: if ``terms`` is unknown.
     """
+    table = table if isinstance(table, Correspondences) else load_correspondences(table)
     solution = solve_joint(rig, table, config, terms, camera_matches=camera_matches)
     record = ImageRecord.from_metadata(solution.correspondences.metadata)
     watch = Stopwatch()
@@ -222,7 +223,6 @@ def to_calibration(evidence: Evidence, checks: RunChecks) -> Calibration:
         error_sources=Later(lambda: evidence.error_sources),
         lens=solution.lens,
         lens_covariance=_with_poses(solution.lens_covariance, evidence),
-        bootstrap=evidence.bootstrap,
         places=solution.correspondences.places.of_frames(solution.correspondences.frame),
         correspondences=solution.correspondences,
         camera_matches=solution.camera_matches,

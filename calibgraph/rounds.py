@@ -51,7 +51,7 @@ from calibgraph.solver.joint import add_camera_pairs, solve_joint, solve_without
 from calibgraph.solver.solution import Solution
 from calibgraph.trust.conventions import likely_intended_guess
 from calibgraph.trust.inputs import check_inputs, describe_copies
-from calibgraph.trust.matcher_checks import REMATCH_DEG, REMATCH_M, compare_ends
+from calibgraph.trust.matcher_checks import REMATCH_DEG, REMATCH_M, check_moves, compare_ends
 from factors.columns import CLOCK
 
 Datasets = Dataset | Path | str | Sequence[Path | str]
@@ -61,7 +61,7 @@ _log = logging.getLogger(__name__)
 
 _STANDS, _REPEATS = 0.5, 4
 """Change of a lens or clock, in standard deviations, from which the last round is repeated; how
-often."""
+often. It is also repeated while it moves a camera that is found beyond what a PASS allows."""
 _BETTER = 1.03
 """Ratio of z-scores from which the end of a displaced start replaces the first end. On KITTI, ends
 8 to 12 cm off had 8 to 16 % lower z-scores than those at 3 cm; equally good ends differ by a few
@@ -118,9 +118,12 @@ def match_in_rounds(
         moved, lens = change_of_lens(lens, solution.lens), solution.lens
         if out_of_time():
             break
-        if repeat >= 0 and moved > _STANDS and repeat < _REPEATS:
+        stands = moved <= _STANDS and not (
+            full.tracking_rounds and _moves_on(rounds, table, config)
+        )
+        if 0 <= repeat < _REPEATS and not stands:
             indices.append(index)  # with the new lens
-            note = f"{', '.join(config.estimate)}: repeat {repeat + 1}, at most {_REPEATS}"
+            note = f"repeat {repeat + 1}, at most {_REPEATS}"
     if moved > _STANDS and repeat == _REPEATS:
         warnings = (*warnings, unsettled(config.estimate, moved, repeat))
     missed = full.rounds - 1 - index
@@ -174,10 +177,11 @@ def rematch(run: MatchingRun) -> MatchingRun:
     before its top. A camera whose second end has a clearly higher z-score is taken from there,
     unless the ends are so far apart that the camera fails.
     """
-    ended, tracking = run.solution.T_camera_lidar, run.matcher.tracking_rounds
+    tracking = run.matcher.tracking_rounds
     if not tracking or not run.solution.objective.uses_correspondences:
         return run
-    rig, seed = run.solution.solved_rig, run.solution.config.seed
+    ended, rig = run.solution.T_camera_lidar, run.solution.solved_rig
+    seed = run.solution.config.seed
     start = perturb(rig, rotation_deg=REMATCH_DEG, translation_m=REMATCH_M, seed=seed)
     try:
         again = run_again(run, start, tracking)
@@ -211,7 +215,8 @@ def run_again(
         CorrespondenceError: if a camera gets too few correspondences.
     """
     settings, places = (run.solution.config, run.solution.terms), run.correspondences.places
-    indices = dict.fromkeys((*rounds, run.matcher.rounds - 1))
+    indices = [*dict.fromkeys((*rounds, run.matcher.rounds - 1))]
+    most = len(indices) + _REPEATS
 
     def match(at: Rig, index: int) -> Correspondences:
         table = run.matcher.match(
@@ -230,9 +235,19 @@ def run_again(
     )
     while not run.is_late():
         table, solution, summaries = next(done)
-        if len(summaries) == len(indices):
+        if len(summaries) < len(indices):
+            continue
+        if len(indices) == most or not _moves_on(summaries, run.correspondences, settings[0]):
             return replace(run, correspondences=table, solution=solution, rounds=summaries)
+        indices.append(indices[-1])
     return None
+
+
+def _moves_on(rounds: Sequence[RoundSummary], table: Correspondences, config: Config) -> bool:
+    """Whether the last of several rounds moved a camera that is found beyond what a PASS allows."""
+    missed, checks = table.findings.missed, check_moves(rounds[-1], config.tolerance)
+    found = [check for name, of in checks.items() if name not in missed for check in of]
+    return len(rounds) > 1 and any(check.status != "PASS" for check in found)
 
 
 def better_cameras(

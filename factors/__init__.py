@@ -18,7 +18,6 @@ from factors.conditioning import (
     unit_diagonal,
 )
 from factors.lens import Lens, LensModel, ray_spreads, unproject
-from factors.loss import LOSSES, LossName, robust_noise
 from factors.pairs import (
     PairBlock,
     pair_block_factor,
@@ -26,6 +25,7 @@ from factors.pairs import (
 )
 from factors.pose import (
     camera_prior_factor,
+    cauchy_noise,
     displaced_between_factor,
     linear_factor,
     lossless_factor,
@@ -35,17 +35,16 @@ from factors.pose import (
 )
 
 __all__ = [
-    "LOSSES",
     "BlockSums",
     "Clock",
     "Columns",
     "Lens",
     "LensModel",
-    "LossName",
     "PairBlock",
     "ProjectionBlock",
     "block_factor",
     "camera_prior_factor",
+    "cauchy_noise",
     "displaced_between_factor",
     "displace",
     "fields_px",
@@ -59,7 +58,6 @@ __all__ = [
     "ray_spreads",
     "relative_pose_factor",
     "relative_prior_factor",
-    "robust_noise",
     "smallest_scaled_eigenvalues",
     "to_runs",
     "unit_diagonal",

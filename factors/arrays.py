@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.conditioning import fill_root, unit_diagonal
-from factors.loss import loss_id
 
 Array = NDArray[np.float64]
 _Number = TypeVar("_Number", bound=np.generic)
@@ -45,29 +44,28 @@ class BlockSums:
 
 
 class RobustBlock:
-    """A frozen block of residuals with one robust loss.
+    """A frozen block of residuals with Cauchy's loss.
 
     Attributes:
-        loss: its name.
-        scale: norm of a whitened residual, divided by sigma, at which the loss bends.
+        scale: norm of a whitened residual, divided by sigma, at which the loss bends; infinite for
+            the residuals' squares.
         sigma: divides all whitened residuals.
     """
 
-    loss: str
     scale: float
     sigma: float
 
-    def rescale(self, *, scale: float, sigma: float = 1.0, loss: str | None = None) -> Self:
-        """The same correspondences, not copied, with another scale of the loss, sigma and loss."""
+    def rescale(self, *, scale: float, sigma: float = 1.0) -> Self:
+        """The same correspondences, not copied, with another scale of the loss and sigma."""
         other = self._copy()  # not checked again: its correspondences are of a good block
-        other.__dict__.update(scale=scale, sigma=sigma, loss=loss or self.loss)
-        other._check_loss()
+        other.__dict__.update(scale=scale, sigma=sigma)
+        other._check_scales()
         return other
 
     def with_variance(self, factor: float) -> Self:
         """Residuals with so many times the variance; the loss bends at the same ones [px]."""
         root = factor**0.5
-        return self.rescale(scale=self.scale / root, sigma=self.sigma * root, loss=self.loss)
+        return self.rescale(scale=self.scale / root, sigma=self.sigma * root)
 
     def _copy(self) -> Self:
         """A block with the same attributes, to be changed; faster than ``copy.copy``."""
@@ -75,8 +73,7 @@ class RobustBlock:
         other.__dict__.update(self.__dict__)
         return other
 
-    def _check_loss(self) -> None:
-        loss_id(self.loss)
+    def _check_scales(self) -> None:
         if not (self.scale > 0 and self.sigma > 0):
             name = "sigma" if self.scale > 0 else "scale"
             raise ValueError(f"{name} must be positive, found {getattr(self, name)}")

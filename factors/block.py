@@ -46,8 +46,7 @@ from factors.kernel import (
     summarize,
 )
 from factors.lens import Lens
-from factors.loss import loss_id, robust_noise
-from factors.pose import custom_factor, lossless_factor
+from factors.pose import cauchy_noise, custom_factor, lossless_factor
 
 Array = NDArray[np.float64]
 
@@ -66,23 +65,20 @@ class ProjectionBlock(RobustBlock):
         pixels_px: (n, 2) observed pixels.
         sqrt_information: (n, 3) entries (0,0), (0,1), (1,1) of upper triangular whitening matrices
             [1/px], or None for the identity.
-        loss: name of the robust loss.
-        scale: norm of a whitened residual, divided by sigma, at which the loss bends (the paper's
-            delta).
+        scale: norm of a whitened residual, divided by sigma, at which Cauchy's loss bends (the
+            paper's delta); infinite for the residuals' squares.
         sigma: divides all whitened residuals.
         motion: (n, 7) or None: the twist of the LiDAR, rotation [rad/s] and translation [m/s], and
             how long after its scan the points are where they are here [s].
 
     Raises:
-        ValueError: on wrong shapes, values that are not finite, an unknown loss, a scale or sigma
-            <= 0.
+        ValueError: on wrong shapes, values that are not finite, a scale or sigma <= 0.
     """
 
     lens: Lens
     points_lidar_m: Array
     pixels_px: Array
     sqrt_information: Array | None = None
-    loss: str = "cauchy"
     scale: float = 4.0
     sigma: float = 1.0
     motion: Array | None = None
@@ -96,7 +92,7 @@ class ProjectionBlock(RobustBlock):
         for name, width in _WIDTHS.items():
             if getattr(self, name) is not None:
                 check_shape(name, getattr(self, name), (n, width))
-        self._check_loss()
+        self._check_scales()
         columns = np.empty((5 if self.motion is None else 12, n))
         columns[:3], columns[3:5] = self.points_lidar_m.T, self.pixels_px.T
         if self.motion is not None:
@@ -144,7 +140,7 @@ class ProjectionBlock(RobustBlock):
 
     @staticmethod
     def join(parts: Sequence[ProjectionBlock]) -> ProjectionBlock:
-        """The correspondences of blocks of one lens under each other; loss as of the first."""
+        """The correspondences of blocks of one lens under each other; scale as of the first."""
         roots = join_roots([part.sqrt_information for part in parts], [*map(len, parts)])
         joined, columns = parts[0]._copy(), np.concatenate([p._columns for p in parts], axis=1)
         joined._initialize(columns, *rows_of_root(roots))
@@ -245,8 +241,7 @@ class ProjectionBlock(RobustBlock):
             numbers, units = free.packed
         summarize(lens.kind)(
             lens.packed, contiguous(T_camera_lidar), columns, moves, self._whitening,
-            loss_id(self.loss), self._scales(scales), contiguous(runs), numbers, units,
-            contiguous(step), wanted, out,
+            self._scales(scales), contiguous(runs), numbers, units, contiguous(step), wanted, out,
         )  # fmt: skip
 
     def _columns_at(self, free: Columns, values: Array) -> Array:
@@ -284,7 +279,7 @@ class ProjectionBlock(RobustBlock):
         if self._has_rays:
             accumulate(
                 self.lens.packed, contiguous(T_camera_lidar), self._columns, self._whitening,
-                loss_id(self.loss), self._scales(scales), contiguous(runs), wanted, sums,
+                self._scales(scales), contiguous(runs), wanted, sums,
             )  # fmt: skip
         if not self._has_rays or np.isnan(sums[:, 27]).any():
             products = np.zeros((len(runs), 1, 8, 7))
@@ -293,7 +288,7 @@ class ProjectionBlock(RobustBlock):
         return sums if self.sigma == 1.0 else sums / self.sigma**2
 
     def _scales(self, scales: Array | None) -> Array:
-        """Of the loss: every one has rho(s / sigma^2; delta) = rho(s; delta sigma) / sigma^2."""
+        """Of the loss, which has rho(s / sigma^2; delta) = rho(s; delta sigma) / sigma^2."""
         return np.array([self.scale * self.sigma]) if scales is None else scales * self.sigma
 
     def residuals(self, T_lidar_camera: gtsam.Pose3) -> tuple[Array, NDArray[np.bool_]]:
@@ -403,7 +398,6 @@ def projection_factor(
     pixel_px: ArrayLike,
     *,
     sqrt_information: ArrayLike | None = None,
-    loss: str = "cauchy",
     scale: float = 4.0,
 ) -> gtsam.CustomFactor:
     """One correspondence as a robust projection factor on ``T_lidar_camera`` (paper, Eq. 5).
@@ -417,8 +411,7 @@ def projection_factor(
         point_lidar_m: (3,) point in the LiDAR frame.
         pixel_px: (2,) observed pixel.
         sqrt_information: (2, 2) upper triangular whitening matrix [1/px]; identity if None.
-        loss: name of the robust loss.
-        scale: whitened residual norm at which the loss bends (the paper's delta).
+        scale: whitened residual norm at which Cauchy's loss bends (the paper's delta).
     """
     point = np.asarray(point_lidar_m, dtype=np.float64)
     pixel = np.asarray(pixel_px, dtype=np.float64)
@@ -429,7 +422,7 @@ def projection_factor(
         return residual, [jacobian]
 
     base = gtsam.noiseModel.Gaussian.SqrtInformation(whitening)
-    return custom_factor(robust_noise(base, loss=loss, scale=scale), [key], linearize)
+    return custom_factor(cauchy_noise(base, scale), [key], linearize)
 
 
 def _T_camera_lidar(T_lidar_camera: gtsam.Pose3) -> Array:

@@ -42,21 +42,6 @@ def smallest_scaled_eigenvalues(hessians: Array) -> Array:
     return np.where(known, values[:, 0], 0.0)
 
 
-def are_regular(hessians: Array, least: float) -> NDArray[np.bool_]:
-    """(f,) whether the :func:`smallest_scaled_eigenvalues` are at least that large.
-
-    The others, whose sum is the size of the matrix at most, multiply to a bound: most matrices are
-    regular by their determinant.
-    """
-    diagonals, size = np.einsum("fii->fi", hessians), hessians.shape[1]
-    others = (size / (size - 1)) ** (size - 1)
-    with np.errstate(divide="ignore", invalid="ignore"):  # of free directions
-        bound = np.linalg.det(hessians) / diagonals.prod(axis=1) / others
-    if (bound >= least).all():
-        return np.ones(len(hessians), dtype=np.bool_)
-    return np.asarray(smallest_scaled_eigenvalues(hessians) >= least)
-
-
 def invert_or_none(hessian: Array, *, least: float = SINGULAR) -> Array | None:
     """The inverse of a positive semidefinite matrix, None where a direction is not determined.
 
@@ -68,16 +53,6 @@ def invert_or_none(hessian: Array, *, least: float = SINGULAR) -> Array | None:
         return None
     inverse: Array = (vectors / values) @ vectors.T / np.outer(units, units)
     return inverse
-
-
-def sigmas_of_hessian(hessian: Array) -> Array:
-    """(n,) standard deviations by an (n, n) Hessian; infinite in undetermined directions."""
-    scaled, units = unit_diagonal(hessian)
-    values, vectors = np.linalg.eigh(scaled)
-    free = values < SINGULAR
-    variances = (vectors**2 / np.where(free, np.inf, values)).sum(axis=1) / units**2
-    loose = (vectors[:, free] ** 2).sum(axis=1) > SINGULAR
-    return np.asarray(np.sqrt(np.where(loose, np.inf, variances)))
 
 
 @compiled()

@@ -14,8 +14,10 @@ are not compiled. RAYS is a kind, too.
                  of the cost; or the columns themselves
     evaluate     residuals or their norms
 
-The second derivative of rho(s) / 2 is J^T (psi I + 2 psi' r r^T) J, but for the second derivative
-of r. With t = J^T r it is H + sum 2 psi' t t^T.
+The loss is Cauchy's, rho(s) = k log(1 + s / k) with the square k of a scale, and psi = rho' is
+1 / (1 + s / k); of an infinite scale it is s. The second derivative of rho(s) / 2 is
+J^T (psi I + 2 psi' r r^T) J, but for the second derivative of r; psi' is - psi^2 / k. With
+t = J^T r it is H + sum 2 psi' t t^T.
 """
 
 import math
@@ -36,7 +38,6 @@ from factors.lens_kernels import (
     project_radtan,
     subtract_columns,
 )
-from factors.loss import CAUCHY, loss_and_weight, weight_along
 
 FAST = {"reassoc", "contract", "nsz", "arcp"}
 """The arithmetic that LLVM may assume; NaN and infinity keep their meaning."""
@@ -74,7 +75,7 @@ _SMALL = 1e-100  # far from the smallest float by more than four factors
 
 
 @compiled(fastmath=FAST)
-def accumulate(lens, poses, columns, whitening, loss, scales, runs, wanted, out):  # type: ignore[no-untyped-def]
+def accumulate(lens, poses, columns, whitening, scales, runs, wanted, out):  # type: ignore[no-untyped-def]
     """Fill (r, SUMS) sums of RAYS over the runs ``runs[i, 0]:runs[i, 1]``.
 
     ``poses`` (r, 4, 4) are T_camera_lidar and ``scales`` (r,) the loss', each of one run, or
@@ -96,7 +97,7 @@ def accumulate(lens, poses, columns, whitening, loss, scales, runs, wanted, out)
                 w = whitening[0, np.uint64(start + k)]
                 ru[k] *= w
                 rv[k] *= w
-            sums[27] += weigh(loss, scale, n, ru, rv, psi)
+            sums[27] += weigh(scale, n, ru, rv, psi)
             if wanted == COST:
                 continue
             for k in range(n):
@@ -117,7 +118,7 @@ def summarize(kind: int) -> Any:
 
     @compiled(fastmath=FAST)
     def summarize_runs(  # type: ignore[no-untyped-def]
-        lens, poses, columns, moves, whitening, loss, scales, runs, free, units, step, wanted, out
+        lens, poses, columns, moves, whitening, scales, runs, free, units, step, wanted, out
     ):
         """Fill products of columns, or the columns.
 
@@ -160,11 +161,11 @@ def summarize(kind: int) -> Any:
                     for i in range(2 * n):
                         residuals[i] += step[k] * rows[k, i]
                 psi, sums = tile[PSI], out[run, 0]
-                sums[size, 0] += weigh(loss, scale, n, residuals, residuals[n:], psi)
+                sums[size, 0] += weigh(scale, n, residuals, residuals[n:], psi)
                 if wanted == COST:
                     continue
                 if wanted == CURVATURE:
-                    fill_bends(loss, scale, n, psi, rows, bends)
+                    fill_bends(scale, n, psi, rows, bends)
                     add_products(n, bends, out[run, 1])
                 total = 0.0
                 for i in range(n):
@@ -258,17 +259,14 @@ def by_lens(number, lens, a, b, s, over, u, v):  # type: ignore[no-untyped-def]
 
 
 @compiled(part=True, fastmath=FAST)
-def fill_bends(loss, scale, n, psi, rows, bends):  # type: ignore[no-untyped-def]
+def fill_bends(scale, n, psi, rows, bends):  # type: ignore[no-untyped-def]
     """Each column's part of J^T r, times the root of -2 psi'."""
-    last = len(rows) - 1
-    ru, rv, roots = rows[last], rows[last][n:], bends[last]
-    for i in range(n):
-        s = ru[i] * ru[i] + rv[i] * rv[i]
-        least = s if s > 0.0 else 1.0
-        roots[i] = math.sqrt(max(psi[i] - weight_along(loss, scale, s, psi[i]), 0.0) / least)
+    residuals, root = rows[len(rows) - 1], math.sqrt(2.0) / scale
+    ru, rv = residuals, residuals[n:]
     for k in range(len(rows)):
         for i in range(n):
-            bends[k, i] = roots[i] * (rows[k, i] * ru[i] + rows[k, np.uint64(n + i)] * rv[i])
+            along = rows[k, i] * ru[i] + rows[k, np.uint64(n + i)] * rv[i]
+            bends[k, i] = root * psi[i] * along
 
 
 @compiled(part=True, fastmath=FAST)
@@ -299,20 +297,20 @@ def whiten(whitening, start, n, rows, first):  # type: ignore[no-untyped-def]
 
 
 @compiled(part=True, fastmath=FAST)
-def weigh(loss, scale, n, ru, rv, psi):  # type: ignore[no-untyped-def]
+def weigh(scale, n, ru, rv, psi):  # type: ignore[no-untyped-def]
     """Fill in the weights psi; return the sum of rho.
 
-    Of Cauchy's it is the logarithm of a product, taken before it leaves the range of a float.
+    That is the logarithm of a product, taken before it leaves the range of a float; of an infinite
+    scale, the sum of squares.
     """
-    if loss != CAUCHY:
-        cost = 0.0
-        for i in range(n):
-            rho, psi[i] = loss_and_weight(loss, scale, ru[i] * ru[i] + rv[i] * rv[i])
-            cost += rho
-        return cost
     k = 1.0 / (scale * scale)
     for i in range(n):
         psi[i] = 1.0 / (1.0 + k * (ru[i] * ru[i] + rv[i] * rv[i]))
+    if k == 0.0:
+        squares = 0.0
+        for i in range(n):
+            squares += ru[i] * ru[i] + rv[i] * rv[i]
+        return squares
     logarithms, a, b, c, d = 0.0, 1.0, 1.0, 1.0, 1.0  # four, because one would wait for itself
     for i in range(n // 4):
         a *= psi[4 * i]

@@ -41,7 +41,6 @@ from factors.compiled import compiled
 from factors.kernel import FAST, TILE, WIDTH, add_products, weigh
 from factors.lens import Lens, ray_spreads, unproject
 from factors.lens_kernels import is_projectable, project_one, subtract_columns
-from factors.loss import loss_id
 from factors.pose import lossless_factor
 
 Array = NDArray[np.float64]
@@ -59,23 +58,21 @@ class PairBlock(RobustBlock):
         kind: of B's lens; EPIPOLAR, where features have no surface.
         lens: parameters of B's.
         features: (n, 8) f, q and the pixel in B; of epipolar ones, (n, 18) f_a, F_a, f_b, F_b.
-        loss: name of the robust loss.
         scale: of the residual over sigma, at which the loss bends.
         sigma: what all residuals are divided by [px].
 
     Raises:
-        ValueError: on an unknown loss, a scale or sigma <= 0.
+        ValueError: on a scale or sigma <= 0.
     """
 
     kind: int
     lens: Array
     features: Array
-    loss: str = "cauchy"
     scale: float = 4.0
     sigma: float = 1.0
 
     def __post_init__(self) -> None:
-        self._check_loss()
+        self._check_scales()
         self.__dict__["features"] = contiguous(self.features)
 
     @staticmethod
@@ -162,7 +159,7 @@ class PairBlock(RobustBlock):
         """
         residuals, visible = np.empty((len(self), 2)), np.empty(len(self), np.bool_)
         poses, none = (T_lidar_a.matrix()[None], T_lidar_b.matrix()[None]), np.empty((0, 13, 13))
-        plain = self.rescale(scale=self.scale, loss="l2")
+        plain = self.rescale(scale=np.inf)
         plain._evaluate(*poses, np.array([0, len(self)]), (none, none[:, 0, 0], residuals, visible))
         return residuals, visible
 
@@ -171,7 +168,7 @@ class PairBlock(RobustBlock):
     ) -> None:
         _sum_runs(
             self.kind, self.lens, contiguous(T_lidar_a), contiguous(T_lidar_b), self.features,
-            loss_id(self.loss), self.scale, self.sigma, contiguous(edges), *out,
+            self.scale, self.sigma, contiguous(edges), *out,
         )  # fmt: skip
 
 
@@ -209,7 +206,7 @@ def placed_factor(
 
 @compiled(fastmath=FAST)
 def _sum_runs(  # type: ignore[no-untyped-def]
-    kind, lens, T_a, T_b, features, loss, scale, sigma, edges, sums, costs, residuals, visible
+    kind, lens, T_a, T_b, features, scale, sigma, edges, sums, costs, residuals, visible
 ):
     """Fill (r, 13, 13): H and, in the last column, b; (r,) c. Or residuals, where there is room."""
     axes, psi, rv = 1 if kind == EPIPOLAR else 2, np.empty(TILE), np.zeros(TILE)
@@ -231,7 +228,7 @@ def _sum_runs(  # type: ignore[no-untyped-def]
                     visible[start + i] = seen
             if len(residuals):
                 continue
-            costs[run] += weigh(loss, scale, n, tile[12], rv, psi)
+            costs[run] += weigh(scale, n, tile[12], rv, psi)
             for i in range(n):
                 root = math.sqrt(psi[i])
                 for row in range(13):

@@ -78,6 +78,14 @@ def lossless_factor(
     return custom_factor(noise, keys, linearize)
 
 
+def cauchy_noise(base: gtsam.noiseModel.Gaussian, scale: float) -> gtsam.noiseModel.Base:
+    """GTSAM's stock noise model with Cauchy's loss, which bends at a whitened norm, if finite."""
+    if np.isinf(scale):
+        return base
+    loss = gtsam.noiseModel.mEstimator.Cauchy.Create(scale)
+    return gtsam.noiseModel.Robust.Create(loss, base)
+
+
 def linear_factor(
     keys: Sequence[int], matrices: Sequence[Array], noise: gtsam.noiseModel.Base
 ) -> gtsam.CustomFactor:

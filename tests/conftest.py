@@ -58,9 +58,12 @@ KANNALA = (0.02, -0.004, 0.001, -0.0002)
 
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Files with slow tests come first: at the end one process would wait for the other."""
+    """Files with slow tests come first: at the end one process would wait for the other.
+
+    Then those of ``vehicle``: processes that share the last files each make what is made once.
+    """
     slow = {item.path for item in items if item.get_closest_marker("slow")}
-    items.sort(key=lambda item: item.path not in slow)
+    items.sort(key=lambda item: (item.path not in slow, item.path.parent.name != "vehicle"))
 
 
 def pytest_collection_finish() -> None:
@@ -145,7 +148,7 @@ class CommandRun:
 
 
 def leave_out_diagrams(patch: pytest.MonkeyPatch) -> None:
-    for name in ("convergence", "coverage", "residual_map", "residual_scatter"):
+    for name in ("coverage", "residual_map"):
         patch.setattr(plots, name, lambda *_: "data:image/png;base64,")
 
 
@@ -235,6 +238,12 @@ def mixed_rig() -> Rig:
             "side": make_camera((0.0, 0.4, -0.1), yaw_deg=80, model="fisheye", distortion=KANNALA),
         }
     )
+
+
+@pytest.fixture(scope="session")
+def truth() -> Rig:
+    """The sample's rig at its true poses."""
+    return load_rig(SAMPLE / "reference.yaml")
 
 
 @pytest.fixture(scope="session")

@@ -41,11 +41,6 @@ STATED = {
 
 
 @pytest.fixture(scope="module")
-def truth() -> Rig:
-    return calibgraph.load_rig(SAMPLE / "reference.yaml")
-
-
-@pytest.fixture(scope="module")
 def guess(truth: Rig) -> Rig:
     return perturb(truth, rotation_deg=1, translation_m=0.1, seed=3)
 
@@ -166,7 +161,7 @@ def test_places_of_the_table_count_in_the_solve(guess: Rig, truth: Rig) -> None:
 
 def test_the_checks_of_a_solution_are_those_of_its_table(guess: Rig, truth: Rig) -> None:
     """A solve of a saved table gives its own verdict, to the last check."""
-    first = calibgraph.solve(guess, table_of(truth), Config(bootstrap=5))
+    first = calibgraph.solve(guess, table_of(truth))
     again = solve_again(replace(first, rig=first.initial_rig))
     assert again.verdict == first.verdict
 

@@ -34,14 +34,14 @@ def paper_solve(
         rig: lenses, and the order of the cameras.
         table: preprocessed correspondences.
         T_hat: (4, 4) Stage-1 estimate of T_camera_lidar per camera; also the start.
-        config: with a Cauchy loss, ``loss_scale_px`` and ``gate_px``.
+        config: with ``loss_scale_px`` and ``gate_px``.
         terms: terms of the objective.
 
     Raises:
-        ValueError: if the settings leave scales to the data, or have another loss.
+        ValueError: if the settings leave scales to the data.
     """
-    if config.loss_scale_px is None or config.gate_px is None or config.loss != "cauchy":
-        raise ValueError("the paper's solver needs a Cauchy loss, its loss_scale_px and a gate_px")
+    if config.loss_scale_px is None or config.gate_px is None:
+        raise ValueError("the paper's solver needs a loss_scale_px and a gate_px")
     if terms == "stage1":
         return dict(T_hat)
     blocks = camera_blocks(rig, table, config) if terms != "priors" else {}

@@ -1,7 +1,7 @@
 """Is a calibration still right? Measured by images and clouds, or by several results."""
 
 from calibgraph.audit.check import check
-from calibgraph.audit.drift import Drift, Trend, drift, drift_summary
+from calibgraph.audit.drift import Drift, drift, drift_summary
 from calibgraph.audit.result import Audit, CameraAudit, LidarAudit, audit_summary
 
 __all__ = [
@@ -9,7 +9,6 @@ __all__ = [
     "CameraAudit",
     "Drift",
     "LidarAudit",
-    "Trend",
     "audit_summary",
     "check",
     "drift",

@@ -6,7 +6,6 @@ from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
-from pydantic import BaseModel
 from scipy.linalg import block_diag
 from scipy.special import ndtri
 
@@ -23,7 +22,7 @@ from calibgraph.audit.judgement import (
 from calibgraph.audit.lidars import MeasuredLidars, measure_lidars
 from calibgraph.audit.result import Audit, CameraAudit, LidarAudit
 from calibgraph.errors import CorrespondenceError, FileError
-from calibgraph.files import load_model
+from calibgraph.io.calibrations import stated_result
 from calibgraph.io.dataset import Dataset, keep_frames, load_dataset
 from calibgraph.io.frame import hash_source
 from calibgraph.io.rigs import load_rig
@@ -33,10 +32,10 @@ from calibgraph.matching.named import find_matcher
 from calibgraph.matching.protocol import FullMatcher
 from calibgraph.matching.run import MatchingRun
 from calibgraph.matching.same_images import require_different_images
-from calibgraph.model.config import Config, Reported
+from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import pose_difference
-from calibgraph.model.result_files import CALIBRATION_FILE, is_calibration_file
+from calibgraph.model.result_files import CALIBRATION_FILE
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import Status
 from calibgraph.parallel import with_own_threads
@@ -263,19 +262,6 @@ def _doubt_by_z_score(z_score: float | None) -> str:
     )
 
 
-class _Part(BaseModel):
-    status: Status | None = None
-    of: Reported = "alignment"
-
-
-class _Result(BaseModel):
-    """What is used here of the file of a result."""
-
-    inputs: dict[str, str] = {}
-    verdict: _Part = _Part()
-    config: _Part = _Part()
-
-
 def provenance(rig: Path | str, data: Dataset) -> tuple[bool, Status | None]:
     """Whether a recording is the deployed result's own; its verdict, None of other rigs.
 
@@ -285,18 +271,17 @@ def provenance(rig: Path | str, data: Dataset) -> tuple[bool, Status | None]:
         FileError: if the result is malformed, or of mounts; or a cloud cannot be read.
     """
     path = Path(rig) / CALIBRATION_FILE if Path(rig).is_dir() else Path(rig)
-    if not is_calibration_file(path):
+    if (result := stated_result(path)) is None:
         return False, None
-    result = load_model(_Result, path)
-    if result.config.of != "alignment":
+    if result.of != "alignment":
         raise FileError(
-            path, f"has poses of the {result.config.of}, and check compares alignments; give the "
+            path, f"has poses of the {result.of}, and check compares alignments; give the "
             "alignment, by `calibgraph solve` of its table with --of alignment",
         )  # fmt: skip
     names = {Path(source).name for source in result.inputs}
     clouds = (frame.cloud_path for frame in data.frames if frame.cloud_path.name in names)
     same = any(hash_source(cloud) in result.inputs.values() for cloud in clouds)
-    return same, result.verdict.status
+    return same, result.status
 
 
 _REACH_DEG, _REACH_CM = 0.7, 20.0

@@ -16,7 +16,6 @@ from calibgraph.audit.judgement import (
     LIDAR_AXES,
     SINGLE_CAMERA,
     SINGLE_LIDAR,
-    describe_motion,
     detectable,
     find_lidar_motion,
     judge_deviation,
@@ -24,8 +23,8 @@ from calibgraph.audit.judgement import (
     tolerance_twist,
 )
 from calibgraph.audit.lidars import freedom_of_places
-from calibgraph.audit.model import Deviations, Limits, compare, fit_slope, poses_of
-from calibgraph.audit.result import ORDER, CameraAudit, LidarAudit, by_unit, lidar_summary
+from calibgraph.audit.model import Deviations, Limits, compare, poses_of
+from calibgraph.audit.result import ORDER, CameraAudit, LidarAudit, lidar_summary
 from calibgraph.errors import CalibrationError
 from calibgraph.io.calibrations import load_calibration
 from calibgraph.model.calibration import Calibration
@@ -36,10 +35,9 @@ from calibgraph.model.verdict import COMMON_ERROR
 from calibgraph.solver.covariance import PSEUDO_FRAMES
 
 FALSE_ALARM_RATE = 0.01
-"""Probability of a significant axis in one call, over all cameras, results and trends."""
+"""Probability of a significant axis in one call, over all cameras and results."""
 
 _LIDAR_AXES = tuple(f"{verb} {axis}" for verb in ("about", "along") for axis in "xyz")
-_LATEST_DAY = 1e9  # twice the present time in seconds
 
 _FAILED = "its verdict is FAIL, so that nothing is known of its error: do what its report advises"
 _NO_ERROR_BAR = "it has no error bar: its matches do not determine the camera"
@@ -50,33 +48,12 @@ _ALONE = "no other result has an error bar of this camera that holds; give more 
 
 
 @dataclass(frozen=True, eq=False)
-class Trend:
-    """A steady motion of one camera over all results.
-
-    Attributes:
-        changed: whether it is significant, beyond the tolerance over all results, and explains
-            them better than changes of single results do.
-        reason: one sentence.
-        slope: (6,) rotation [rad], translation [m], per unit.
-        sigma: (6,) standard deviations of ``slope``.
-        unit: "day", or "result" for the order in which they were given.
-    """
-
-    changed: bool
-    reason: str
-    slope: Array
-    sigma: Array
-    unit: str
-
-
-@dataclass(frozen=True, eq=False)
 class Drift:
     """A comparison of results of one rig.
 
     Attributes:
         results: their names.
         cameras: per camera, one entry per result.
-        trends: per camera with an error bar in three results or more.
         lidar: per result, how the LiDAR moved, where that alone explains the deviation of every
             camera; None otherwise.
         tolerance_deg, tolerance_cm: largest turn and shift that are OK.
@@ -87,7 +64,6 @@ class Drift:
 
     results: tuple[str, ...]
     cameras: Mapping[str, tuple[CameraAudit, ...]]
-    trends: Mapping[str, Trend]
     lidar: tuple[LidarAudit | None, ...]
     tolerance_deg: float
     tolerance_cm: float
@@ -108,15 +84,13 @@ class Drift:
 
     @property
     def status(self) -> str:
-        """CHANGED if any trend is; otherwise the worst status of a camera in a result."""
-        if any(trend.changed for trend in self.trends.values()):
-            return "CHANGED"
+        """The worst status of a camera in a result."""
         every = (each.status for entries in self.cameras.values() for each in entries)
         return max(every, key=ORDER.index)
 
     @property
     def changed(self) -> tuple[tuple[str, str], ...]:
-        """Pairs of a result and what CHANGED there: "LiDAR", or a camera. Without the trends."""
+        """Pairs of a result and what CHANGED there: "LiDAR", or a camera."""
         return tuple(
             (result, name)
             for place, (result, lidar) in enumerate(zip(self.results, self.lidar, strict=True))
@@ -132,7 +106,6 @@ Results: TypeAlias = Sequence[Result] | Mapping[str, Result]
 def drift(
     results: Results,
     *,
-    days: Sequence[float] | None = None,
     tolerance_deg: float = 0.5,
     tolerance_cm: float = 10.0,
     own_lenses: bool = False,
@@ -145,7 +118,6 @@ def drift(
 
     Args:
         results: two or more, or their folders or files; of a mapping the keys are their names.
-        days: when each was recorded, for the trend; the order given if None.
         tolerance_deg: largest turn of a camera that is OK.
         tolerance_cm: largest shift of a camera that is OK.
         own_lenses: whether the parameters of the lenses may differ, as between vehicles.
@@ -156,31 +128,20 @@ def drift(
 
     Raises:
         CalibrationError: if a file cannot be read, or the results are not of one rig.
-        ValueError: if a tolerance is not positive, or there is not a day for each result.
+        ValueError: if a tolerance is not positive.
     """
     tolerance = tolerance_twist(tolerance_deg, tolerance_cm)
     opened = open_results(results, own_lenses=own_lenses)
     names, loaded, count = (*opened,), (*opened.values(),), len(opened)
-    at = np.arange(count, dtype=np.float64) if days is None else np.array(days, np.float64)
-    if at.shape != (count,) or not (np.abs(at) <= _LATEST_DAY).all():
-        raise ValueError(
-            f"days: expected {count} numbers up to {_LATEST_DAY:g}, one per result, found {days}"
-        )
     cameras = loaded[0].joint_names
-    limits = Limits(FALSE_ALARM_RATE / (2 * 6 * len(cameras) * (count + 1)), tolerance)
+    limits = Limits(FALSE_ALARM_RATE / (2 * 6 * len(cameras) * count), tolerance)
     found = {name: _deviations(loaded, name, limits) for name in cameras}
     judged = {name: _judge(opened, name, each, limits) for name, each in found.items()}
     compared = {name: each for name, each in found.items() if each is not None}
-    unit = "result" if days is None else "day"
-    trends = {
-        name: _trend(each, at, unit, limits, axes=_axes(loaded[0], name))
-        for name, each in compared.items()
-    }
     hashes = {name: {*result.inputs.values()} for name, result in opened.items()}
     return Drift(
         results=names,
         cameras=judged,
-        trends={name: trend for name, trend in trends.items() if trend is not None},
         lidar=tuple(
             _lidar(loaded, place, compared, judged, limits=limits) for place in range(count)
         ),
@@ -343,35 +304,6 @@ def _joint_covariance(
     return whole if np.linalg.eigvalsh(whole)[0] > 0 else None
 
 
-def _trend(
-    found: Deviations, at: Array, unit: str, limits: Limits, *, axes: tuple[str, ...]
-) -> Trend | None:
-    """The steady motion of one camera; None with fewer than three results, or of one time.
-
-    It counts if it explains the results better than changes of single ones, by what is left of
-    the scatter and twice the numbers that each needs (Akaike's criterion).
-    """
-    poses, count = found.poses, len(found.poses)
-    x = at[poses.results]
-    slope = fit_slope(x, np.zeros(count, np.intp), poses.information, poses.twist)
-    if count < 3 or slope is None:  # noqa: PLR2004 - a line passes through two
-        return None
-    span, (change, covariance) = float(np.ptp(x)), slope
-    whole, sigma = change * span, np.sqrt(np.diag(covariance)) * span
-    freedom = np.array(poses.freedom.sum())
-    explained = float(change @ np.linalg.solve(covariance, change))
-    by_slope = poses.scatter(np.ones(count, np.bool_)) - explained + 2 * 6
-    by_changes = poses.scatter(found.agreeing) + 2 * 6 * np.count_nonzero(~found.agreeing)
-    beyond = bool(limits.exceeded(whole, sigma, freedom).any())
-    changed = beyond and bool(by_slope < by_changes)
-    clear = np.abs(whole) > limits.sigmas(freedom) * sigma
-    why = "; changes of single results explain it better" if beyond else ", within the tolerance"
-    reason = describe_motion(whole, sigma, clear, axes)
-    reason += f" from the first to the last result{'' if changed else why}"
-    reason = reason if clear.any() else "no significant trend"
-    return Trend(changed, reason, change, sigma / span, unit)
-
-
 def open_results(given: Results, *, own_lenses: bool) -> dict[str, Calibration]:
     """The results by their names: those given, of files the paths below their common folder.
 
@@ -445,17 +377,13 @@ def drift_summary(drift: Drift) -> dict[str, Any]:
     """A comparison as plain values; every key names its unit, every list is x, y, z."""
     cameras = {}
     for name, entries in drift.cameras.items():
-        trend, axes = drift.trends.get(name), _LIDAR_AXES if name in drift.lidars else CAMERA_AXES
+        axes = _LIDAR_AXES if name in drift.lidars else CAMERA_AXES
         cameras[name] = {
             "results": {
                 result: each.summary(axes=[axes[axis] for axis in each.axes])
                 for result, each in zip(drift.results, entries, strict=True)
             },
-            "trend": None if trend is None else {
-                "changed": trend.changed, "reason": trend.reason, "per": trend.unit,
-                **by_unit("slope", trend.slope), **by_unit("sigma", trend.sigma),
-            },
-        }  # fmt: skip
+        }
     lidars = zip(drift.results, drift.lidar, strict=True)
     return {
         "status": drift.status,

@@ -25,7 +25,6 @@ from calibgraph.audit.judgement import axes_beyond
 from calibgraph.model.geometry import twists_between
 
 _EYE = np.eye(6)
-_ROUNDING = 1e-9  # relative eigenvalue of the information about a slope
 
 
 def weighted_mean(y: Array, information: Array) -> tuple[Array, Array]:
@@ -124,12 +123,6 @@ class Poses:
 
     def __len__(self) -> int:
         return len(self.results)
-
-    def scatter(self, kept: Mask) -> float:
-        """Chi-squared of these results about their mean, with 6 (n - 1) degrees of freedom."""
-        W, y = self.information[kept], self.twist[kept]
-        y = y - weighted_mean(y, W)[0]
-        return float(np.einsum("ni,nij,nj->", y, W, y))
 
 
 def poses_of(results: list[int], T_camera_lidar: Array, covariance: Array, freedom: Array) -> Poses:
@@ -273,37 +266,3 @@ def _ambiguous_pairs(poses: Poses, agreeing: Mask, limits: Limits) -> Mask:
 def _variances(covariance: Array) -> Array:
     """(n, 6) diagonals of (n, 6, 6) covariances."""
     return np.asarray(np.diagonal(covariance, axis1=1, axis2=2))
-
-
-def fit_slope(
-    x: Array, batch: NDArray[np.intp], information: Array, y: Array
-) -> tuple[Array, Array] | None:
-    """The slope of deviations over x, within batches, by generalised least squares.
-
-    Each batch has its own centre, so that a change between batches is no slope.
-
-    Args:
-        x: (n,) where each was measured; NaN where that is not known.
-        batch: (n,) number of the batch of each.
-        information: (n, 6, 6) inverse covariances.
-        y: (n, 6) deviations.
-
-    Returns:
-        (6,) change per unit of x and its (6, 6) covariance; None where x does not vary.
-    """
-    known = np.isfinite(x)
-    hessian, right = np.zeros((6, 6)), np.zeros(6)
-    unit = float(np.std(x[known])) if known.any() else 0.0
-    for number in np.unique(batch[known]) if unit > 0 else ():
-        rows = known & (batch == number)
-        W, scaled = information[rows], (x[rows] - x[rows].mean()) / unit
-        total, first = W.sum(axis=0), np.einsum("n,nij->ij", scaled, W)
-        Wy = np.einsum("nij,nj->ni", W, y[rows])
-        share = np.linalg.solve(total, np.column_stack([first, Wy.sum(axis=0)]))
-        hessian += np.einsum("n,nij->ij", scaled**2, W) - first @ share[:, :6]
-        right += scaled @ Wy - first @ share[:, 6]
-    values = np.linalg.eigvalsh(hessian)
-    if values[0] <= _ROUNDING * max(values[-1], 1e-300):
-        return None
-    covariance = np.asarray(np.linalg.inv(hessian), dtype=np.float64)
-    return covariance @ right / unit, covariance / unit**2

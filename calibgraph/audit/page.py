@@ -129,17 +129,12 @@ def audit_table(audit: Audit) -> Table:
 
 
 def _drift_lines(drift: Drift) -> list[str]:
-    """A line per camera and result, and per trend and LiDAR that stands out; OK ones together."""
+    """A line per camera and result, and per LiDAR that stands out; OK ones together."""
     base, others = ("base LiDAR", "other sensors") if drift.lidars else ("LiDAR", "cameras")
     lines = [
         f"CHANGED {result}, {base}: {lidar.reason}; all {others} agree on it"
         for result, lidar in zip(drift.results, drift.lidar, strict=True)
         if lidar is not None
-    ]
-    lines += [
-        f"CHANGED {name}, trend: {trend.reason}"
-        for name, trend in drift.trends.items()
-        if trend.changed
     ]
     lines += [
         f"{each.status} {result}, {name}: {each.reason}"
@@ -151,7 +146,7 @@ def _drift_lines(drift: Drift) -> list[str]:
 
 
 def drift_table(drift: Drift) -> Table:
-    """Two rows per camera and result, the deviation and the detectable one, and the trend."""
+    """Two rows per camera and result, the deviation and the detectable one."""
     rows = []
     for name, entries in drift.cameras.items():
         for row, (result, each) in enumerate(zip(drift.results, entries, strict=True)):
@@ -159,9 +154,5 @@ def drift_table(drift: Drift) -> Table:
             cells = twist_cells(each.deviation, 2, "+")
             rows.append(["" if row else name, escape(result), status, *cells])
             rows.append(["", "", "detectable", *twist_cells(each.detectable, 2)])
-        trend = drift.trends.get(name)
-        if trend is not None:
-            rows.append(["", "trend", f"per {trend.unit}", *twist_cells(trend.slope, 3, "+")])
-            rows.append(["", "sigma", "", *twist_cells(trend.sigma, 3)])
     names = ("camera", "result")
     return make_table("Deviation from the other results", rows, names=names, words=("",))

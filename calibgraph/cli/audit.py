@@ -1,7 +1,5 @@
 """The commands that compare calibrations with a recording, and with each other: check, drift."""
 
-from contextlib import suppress
-from datetime import date
 from pathlib import Path
 
 import typer
@@ -68,9 +66,6 @@ def drift(
     results: list[Path] = Argument(
         ..., metavar="RESULT...", help="Of one rig: their folders, or calibration.yaml files."
     ),
-    days: str | None = Option(
-        None, metavar="DAY,DAY,...", help="When each was recorded: dates, or numbers of days."
-    ),
     tolerance_deg: options.ToleranceDeg = 0.5,
     tolerance_cm: options.ToleranceCm = 10.0,
     own_lenses: bool = Option(
@@ -86,13 +81,8 @@ def drift(
     from calibgraph.audit import drift
 
     with checked_arguments():
-        found = drift(
-            results,
-            days=None if days is None else _parse_days(days),
-            tolerance_deg=tolerance_deg,
-            tolerance_cm=tolerance_cm,
-            own_lenses=own_lenses,
-        )
+        sizes = {"tolerance_deg": tolerance_deg, "tolerance_cm": tolerance_cm}
+        found = drift(results, **sizes, own_lenses=own_lenses)
     if as_json:
         from calibgraph.audit import drift_summary
 
@@ -103,20 +93,3 @@ def drift(
         print_drift(terminal(), found)
         print_line("nothing was written")
     raise typer.Exit(_EXIT_CODES[found.status])
-
-
-def _parse_days(text: str) -> list[float]:
-    """Days of dates or numbers, separated by commas."""
-
-    def parse(part: str) -> float:
-        with suppress(ValueError):
-            return float(part)
-        return float(date.fromisoformat(part).toordinal())
-
-    try:
-        return [parse(part.strip()) for part in text.split(",")]
-    except ValueError as error:
-        raise ValueError(
-            f"--days {text!r}: expected a date like 2026-03-01 or a number, for each result, "
-            "separated by commas"
-        ) from error

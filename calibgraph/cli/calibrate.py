@@ -193,11 +193,11 @@ def _rig_files(rig: Path | None) -> list[Path]:
 
 def _warned_of_same_data(result: Calibration, rig: Path | None) -> Calibration:
     """With a warning if what was estimated has a prior that is from the same data."""
-    from calibgraph.io.calibrations import is_made_from
+    from calibgraph.io.calibrations import stated_result
     from calibgraph.io.rigs import rig_file
 
-    inputs = result.inputs.values()
-    if rig is None or not result.config.estimate or not is_made_from(rig_file(rig), inputs):
+    stated = stated_result(rig_file(rig)) if rig and result.config.estimate else None
+    if stated is None or stated.hashes.isdisjoint(result.inputs.values()):
         return result
     text = (
         f"{rig} was made from the same data, which count twice in the estimates of lens and clock: "
@@ -243,7 +243,7 @@ def track(
     out: Path = Option(
         Path("tracking"),
         metavar="DIR",
-        help="Folder for the state, the result and a picture. A state in it is resumed.",
+        help="Folder for the state and the result. A state in it is resumed.",
     ),
     step: int = Option(1, min=1, help="With --matcher: match every N-th frame only."),
     matcher: str | None = Option(None, metavar="NAME", help="Match frames: structure or cmrnext."),

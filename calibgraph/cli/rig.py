@@ -1,4 +1,4 @@
-"""The command for a rig to begin with: from a bag, a folder, words, files of others, a search."""
+"""The command for a rig to begin with: from a bag, a folder, words, or files of others."""
 
 from __future__ import annotations
 
@@ -23,15 +23,11 @@ if TYPE_CHECKING:
     from calibgraph.io.rig_parts import RigParts
     from calibgraph.model.rig import Rig
 
-_SEARCH = "search"
-
-
 _TAKEN = {
     "a folder of images and clouds": {"mount", "lens"},
-    "bags alone": {"topic", "tie_deg", "tie_m", "correct", "json"},
-    "files": {"mount", "dataset", "rename", "lidar_frame", "camera_frame", "size", "tie_deg",
-              "tie_m", "correct", "json"},
-}  # fmt: skip
+    "bags alone": {"topic", "correct", "json"},
+    "files": {"mount", "rename", "lidar_frame", "camera_frame", "size", "correct", "json"},
+}
 """The options that change something, by the kind of source."""
 
 
@@ -50,8 +46,7 @@ def rig(
         metavar="NAME=WORDS",
         help="How a camera is mounted: front, front-left, left, rear-left, rear, ...; then "
         "NUMBER deg left|right|up|down|clockwise|counterclockwise from there, upside down, "
-        "NUMBER m|cm ahead|behind|left|right|above|below of the LiDAR; or search, in the "
-        "images of --dataset, although a file has an extrinsic. May be repeated.",
+        "NUMBER m|cm ahead|behind|left|right|above|below of the LiDAR. May be repeated.",
     ),
     lens: list[str] | None = Option(
         None,
@@ -59,12 +54,6 @@ def rig(
         help="Of a folder: how the lens of a camera, or of all, is known: calibration; a "
         "horizontal field of view, as '90 deg'; or focal length and size of a pixel, as "
         "'4 mm 3 um'. May be repeated. (default: asked in a terminal, else calibration)",
-    ),
-    dataset: list[Path] | None = Option(
-        None,
-        metavar="DATASET",
-        help="Images and clouds, in which cameras without words or an extrinsic in a file are "
-        "searched for, over all headings. May be repeated.",
     ),
     forward: str = Option("+x", metavar="+x|-x|+y|-y", help="The LiDAR's axis ahead; z is up."),
     topic: options.Topic = None,
@@ -81,16 +70,6 @@ def rig(
         "'optical' in its name is x right, y down, z forward, others are x forward, z up.",
     ),
     size: str | None = Option(None, metavar="WIDTHxHEIGHT", help="Image size, if files have none."),
-    tie_deg: float | None = Option(
-        None,
-        metavar="DEG",
-        min=0.001,
-        help="Relative poses are measured, with this sigma per axis; with --tie-m. (default: "
-        "0.1 of files as Kalibr's; those of a bag are only a guess)",
-    ),
-    tie_m: float | None = Option(
-        None, metavar="M", min=1e-5, help="The sigma in translation, per axis. (default: 0.005)"
-    ),
     correct: list[str] | None = Option(
         None,
         metavar="[CAMERA=]MISTAKE",
@@ -104,7 +83,7 @@ def rig(
 
     Of a ROS bag: its topics, lenses and /tf_static. Of a folder: its cameras, and each key that is
     left to fill in explained. Of files of other programs: what they hold together, and how good a
-    guess it is if cameras are described or searched for.
+    guess it is if cameras are described.
     """
     from calibgraph.files import require_new_file
     from calibgraph.io.bags.storage import is_bag
@@ -115,9 +94,8 @@ def rig(
     from calibgraph.trust.conventions import correct_guess
 
     given = {
-        "mount": mount, "lens": lens, "dataset": dataset, "topic": topic, "rename": rename,
-        "lidar_frame": lidar_frame, "camera_frame": camera_frame, "size": size, "tie_deg": tie_deg,
-        "tie_m": tie_m, "correct": correct, "json": as_json or None,
+        "mount": mount, "lens": lens, "topic": topic, "rename": rename, "lidar_frame": lidar_frame,
+        "camera_frame": camera_frame, "size": size, "correct": correct, "json": as_json or None,
     }  # fmt: skip
     path = Path(source[0])
     if len(source) == 1 and not correct and _is_to_fill_in(path):
@@ -126,14 +104,11 @@ def rig(
         return
     if out is not None:
         require_new_file(out, ".yaml", ".yml", force=force)
-    is_of_bag = not (mount or dataset) and all(map(is_bag, source))
+    is_of_bag = not mount and all(map(is_bag, source))
     _refuse_others("bags alone" if is_of_bag else "files", given)
-    with checked_arguments(), progress_bar("reading") as progress:
-        if (tie_deg is None) != (tie_m is None):
-            raise ValueError("--tie-deg and --tie-m: give both")
-        sigmas = None if tie_deg is None or tie_m is None else (tie_deg, tie_m)
+    with checked_arguments(), progress_bar("reading"):
         if is_of_bag:
-            made, notes, topics = _rig_of_bags([*map(Path, source)], topic, sigmas)
+            made, notes, topics = _rig_of_bags([*map(Path, source)], topic)
             guess = None
         else:
             named = [_parse_file(text) for text in source]
@@ -144,8 +119,8 @@ def rig(
             )  # fmt: skip
             notes, topics = [f"note: {note}" for note in parts.notes], []
             made, guess = _rig_of_files(
-                parts, parse_names("--mount", mount), dataset, sigmas, forward=forward,
-                size_px=_size_px(size), progress=progress
+                parts, parse_names("--mount", mount), forward=forward,
+                size_px=_size_px(size),
             )  # fmt: skip
         made = state_calibrated(correct_guess(made, correct or ()))
         guess = guess and replace(guess, rig=made)
@@ -197,41 +172,30 @@ def _size_px(size: str | None) -> tuple[int, int] | None:
 def _rig_of_files(
     parts: RigParts,
     mountings: dict[str, str],
-    dataset: list[Path] | None,
-    sigmas: tuple[float, float] | None,
     **options: Any,
 ) -> tuple[Rig, RigGuess | None]:
-    """The rig, and how good its guess is, where cameras are described or searched for.
+    """The rig, and how good its guess is, where cameras are described.
 
     The options are those of :func:`guess_rig`.
     """
     from calibgraph.guessing.guess import guess_rig
-    from calibgraph.io.rig_parts import RELATIVE_SIGMA_CM, RELATIVE_SIGMA_DEG
 
-    if not mountings and not dataset:
-        deg, metres = sigmas or (RELATIVE_SIGMA_DEG, RELATIVE_SIGMA_CM / 100.0)
-        sizes: dict[str, Any] = {"relative_sigma_deg": deg, "relative_sigma_cm": 100.0 * metres}
-        return parts.to_rig(size_px=options["size_px"], **sizes), None
-    if sigmas is not None:
-        raise ValueError("--tie-deg is for files alone; leave --mount and --dataset out")
-    said = {name: text for name, text in mountings.items() if text != _SEARCH}
-    search = [name for name in mountings if name not in said]
-    guess = guess_rig(parts, mountings=said, data=dataset or None, search=search, **options)
+    if not mountings:
+        return parts.to_rig(size_px=options["size_px"]), None
+    guess = guess_rig(parts, mountings=mountings, **options)
     return guess.rig, guess
 
 
 def _rig_of_bags(
-    paths: list[Path], topic: list[str] | None, sigmas: tuple[float, float] | None
+    paths: list[Path], topic: list[str] | None
 ) -> tuple[Rig, list[str], list[dict[str, Any]]]:
     """The rig of the first bag, notes on it, and its topics; the others serve where it lacks."""
-    from math import radians
-
     from calibgraph.io.bags.messages import Bag
-    from calibgraph.io.bags.rig import doubtful_axes, read_bag_rig, tied_rig
+    from calibgraph.io.bags.rig import doubtful_axes, read_bag_rig
 
     topics = sorted(Bag(paths[0]).topics.values(), key=lambda each: each.name)
     read = read_bag_rig(paths[0], bag_options_from(topic, beside=tuple(paths[1:]) or None))
-    made = tied_rig(read, None if sigmas is None else (radians(sigmas[0]), sigmas[1]))
+    made = read.to_rig()
     listed = [{"topic": each.name, "type": each.type, "messages": each.count} for each in topics]
     return made, [*doubtful_axes(made), *read.notes], listed
 

@@ -137,7 +137,7 @@ def pick(
 
     The server answers this machine only. Ends with Ctrl-C; every change is saved at once.
     """
-    from calibgraph.file_sets import require_own_folder
+    from calibgraph.files import require_own_folder
     from calibgraph.io.rigs import REFERENCE_FILE
     from calibgraph.pick.estimate import SESSION_FILE
     from calibgraph.pick.server import TABLE_FILE, PickServer, Workspace
@@ -207,7 +207,7 @@ def fleet(
         summary = run_fleet(manifest, out, executor=executor, limits=limits, progress=progress)
     report = write_fleet_report(out)
     if as_json:
-        print_json({"out": out, **asdict(summary), "findings": [f.text for f in report.findings]})
+        print_json({"out": out, **asdict(summary), "moved_lidars": [*report.moved_lidars]})
     else:
         _print(summary, report, out)
     if summary.failures or "FAIL" in summary.verdicts:
@@ -235,7 +235,6 @@ def _print(summary: Summary, report: FleetReport, out: str) -> None:
         f"{len({*of.vehicle.tolist()})} vehicles, {int(of.measured.sum())} cameras measured; "
         f"{int(apart.sum())} cameras of {len({*of.vehicle[apart].tolist()})} vehicles stand apart"
     ]
-    lines += [finding.text for finding in report.findings]
     lines += [f"{vehicle}: all cameras moved alike: the LiDAR was moved"
               for vehicle in report.moved_lidars]  # fmt: skip
     for line in [*lines, f"wrote {out}/fleet.html"]:

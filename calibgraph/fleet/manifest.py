@@ -120,7 +120,7 @@ def _read(uri: str) -> pa.Table:
             return table
         if suffix == ".csv":
             strings = csv.ConvertOptions(
-                column_types=dict.fromkeys((*_OWN, "model", "batch"), pa.string()),
+                column_types=dict.fromkeys((*_OWN, "model"), pa.string()),
                 strings_can_be_null=True,
             )
             return csv.read_csv(in_arrow(content), convert_options=strings)

@@ -1,6 +1,7 @@
 """What a fleet's rows show: the model's files, and one page with the state of each camera."""
 
 import json
+import math
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,12 +11,13 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from calibgraph.audit.findings import Finding, describe_size, find_changes, moved_lidars
+from calibgraph.arrays import Array
 from calibgraph.audit.fleet_model import (
     NAMES,
     FleetModel,
     Mount,
     fit_fleet,
+    moved_lidars,
     newest_rows,
     observe,
     words,
@@ -32,11 +34,10 @@ _LONGEST_REASON = 200  # characters
 
 @dataclass(frozen=True, eq=False)
 class FleetReport:
-    """The model of a fleet, everything that stands out, and where each row stands.
+    """The model of a fleet, and where each row stands.
 
     Attributes:
         fleet: the model.
-        findings: the surest first.
         moved_lidars: names of vehicles.
         state: (n,) index into STATES. FAIL: that verdict, or the camera was moved in its mount.
             WARN: that verdict, or no error bar.
@@ -44,7 +45,6 @@ class FleetReport:
     """
 
     fleet: FleetModel
-    findings: Sequence[Finding]
     moved_lidars: Sequence[str]
     state: NDArray[np.uint8]
     reasons: Sequence[str]
@@ -84,10 +84,16 @@ def report_of(rows: pa.Table) -> FleetReport:
              for name in ("reasons", "error")]  # fmt: skip
     reasons = []
     for k, (why, error) in enumerate(zip(*given, strict=True)):
-        size = describe_size(fleet.deviation[k])
+        size = _describe_size(fleet.deviation[k])
         of_row = [text.format(size) for text, of in own.items() if of[k]]
         reasons.append("; ".join([*of_row, *(why or ()), *([error] if error else ())]))
-    return FleetReport(fleet, find_changes(fleet), lidars, state, reasons)
+    return FleetReport(fleet, lidars, state, reasons)
+
+
+def _describe_size(change: Array) -> str:
+    """Angle and distance."""
+    degrees = math.degrees(float(np.linalg.norm(change[:3])))
+    return f"{degrees:.2g} deg, {100 * float(np.linalg.norm(change[3:])):.2g} cm"
 
 
 def _estimates(fleet: FleetModel) -> pa.Table:
@@ -109,28 +115,21 @@ def _estimates(fleet: FleetModel) -> pa.Table:
 
 
 def _summary(report: FleetReport) -> dict[str, Any]:
-    """What is known of every model, and what happened, in plain numbers."""
+    """What is known of every model, in plain numbers."""
     models = {
         name: {"cameras": {camera: _mount(mount) for camera, mount in mounts.items()},
-               "moved_share": next(iter(mounts.values())).pooled.share_moved}
+               "moved_share": next(iter(mounts.values())).share_moved}
         for name, mounts in report.fleet.mounts.items()
     }  # fmt: skip
-    findings = [
-        {"kind": each.kind, "text": each.text, "p_value": each.p_value,
-         "change": None if each.kind == "mount" else each.change.tolist(),
-         "sigma": None if each.kind == "mount" else each.sigma.tolist()}
-        for each in report.findings
-    ]  # fmt: skip
-    return {"format": "calibgraph-fleet-model/2", "models": models, "findings": findings,
+    return {"format": "calibgraph-fleet-model/3", "models": models,
             "moved_lidars": [*report.moved_lidars]}  # fmt: skip
 
 
 def _mount(mount: Mount) -> dict[str, Any]:
-    """Nominal pose, and the covariances of a further vehicle, and of vehicles within a batch."""
-    batches = dict(zip(mount.batches, mount.T_batch.tolist(), strict=True))
+    """Nominal pose, and the covariances of a further vehicle, and of vehicles about the pose."""
     return {"vehicles": len(mount.seen.vehicle), "T": mount.nominal.tolist(),
             "covariance_of_a_vehicle": mount.covariance_of_a_vehicle().tolist(),
-            "spread_within_a_batch": mount.spread.tolist(), "batches": batches}  # fmt: skip
+            "spread": mount.spread.tolist()}  # fmt: skip
 
 
 def _page(report: FleetReport) -> str:
@@ -140,8 +139,8 @@ def _page(report: FleetReport) -> str:
     for k in np.lexsort([of.camera, of.vehicle]):
         date = dates[k] if np.isfinite(of.day[k]) else ""
         vehicle = vehicles.setdefault(str(of.vehicle[k]), {
-            "model": str(of.model[k]), "batch": str(of.batch[k]), "date": date, "state": _PASS,
-            "cameras": defaultdict(list)})  # fmt: skip
+            "model": str(of.model[k]), "date": date, "state": _PASS, "cameras": defaultdict(list)
+        })  # fmt: skip
         vehicle["state"] = max(vehicle["state"], report.state[k])
         if report.state[k] != _PASS:  # the same of several cameras is one line
             alike = STATES[report.state[k]], report.reasons[k][:_LONGEST_REASON]
@@ -153,7 +152,7 @@ def _page(report: FleetReport) -> str:
         counts=counts,
         vehicles=sorted(listed, key=lambda one: -int(one[1]["state"])),
         newest=max((vehicle["date"] for vehicle in vehicles.values()), default=""),
-        findings=report.findings,
+        moved_lidars=report.moved_lidars,
         mounts=[mount for mounts in report.fleet.mounts.values() for mount in mounts.values()],
         spread_cells=lambda mount: twist_cells(np.sqrt(np.diag(mount.spread)), 3),
     )

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
-from calibgraph.model.geometry import to_T_lidar_camera
 from factors import (
     BlockSums,
     Columns,
@@ -79,49 +78,10 @@ class BlockByPlace:
             return self.block.run_sums(T, runs)
         return self.block.summarize(T, runs, self.free, values)
 
-    def factors(self, place: int, keys: Sequence[int]) -> list[gtsam.NonlinearFactor]:
+    def factor(self, place: int, keys: Sequence[int]) -> gtsam.NonlinearFactor:
         """The correspondences of one place, lossless, on cloud, camera and columns there."""
-        first, end = self.edges[place : place + 2].tolist()
-        block = self.block.select(np.arange(first, end))
-        return [placed_factor(keys, block, self.free)] if first < end else []
-
-
-@dataclass(frozen=True, eq=False)
-class QuadraticByPlace:
-    """One camera's correspondences whose sums alone are kept: a quadratic per place.
-
-    Attributes:
-        places: (p,) the places that have correspondences, in rising order.
-        T_lidar_camera: per such place, the minimum.
-        information: (p, 6, 6) in the tangent there, positive definite.
-    """
-
-    places: Numbers
-    T_lidar_camera: Sequence[gtsam.Pose3]
-    information: Array
-
-    def sums(self, T_camera_cloud: Array, values: Array | None = None) -> BlockSums:
-        """H, b and c of every place at a pose of its own, (P, 4, 4), stacked."""
-        assert values is None  # a quadratic is in the pose alone
-        count = len(T_camera_cloud)
-        found = BlockSums(np.zeros((count, 6, 6)), np.zeros((count, 6)), np.zeros(count))
-        for row, place in enumerate(self.places.tolist()):
-            T_lidar_camera = to_T_lidar_camera(T_camera_cloud[place])
-            step = self.T_lidar_camera[row].localCoordinates(T_lidar_camera)
-            found.hessian[place] = self.information[row]
-            found.gradient[place] = found.hessian[place] @ step
-            found.cost[place] = step @ found.gradient[place]
-        return found
-
-    def factors(self, place: int, keys: Sequence[int]) -> list[gtsam.NonlinearFactor]:
-        """The quadratic of one place, a stock factor on cloud and camera there."""
-        noise, (cloud, matched) = gtsam.noiseModel.Gaussian.Information, keys
-        return [
-            gtsam.BetweenFactorPose3(
-                cloud, matched, self.T_lidar_camera[row], noise(self.information[row])
-            )
-            for row in np.flatnonzero(self.places == place).tolist()
-        ]
+        rows = np.arange(*self.edges[place : place + 2])
+        return placed_factor(keys, self.block.select(rows), self.free)
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,10 +28,8 @@ class VarianceComponents:
         distortion_jacobian: (N, 6, B) displacement of a camera's matches by one prior standard
             deviation of each scan distortion; B = 0 without any.
         pair_distortion_jacobian: (N, 6, B) displacement of a camera's pairs by the same.
-        distortion_information: (P, N, B, B) of a camera's residuals at a place about the
-            distortion.
-        distortion_vector: (P, N, B) the information times the distortion that these show.
-        distortion_weight: (P, N) weight of these.
+        distortion_information: (B, B) of the residuals about the distortion.
+        distortion_vector: (B,) the information times the distortion that these show.
         distortion_size: prior variance of the distortion, over the stated one.
         robust_scale: tuning constant [sigmas] of the loss of a place (Geman and McClure);
             infinite: none.
@@ -47,7 +45,6 @@ class VarianceComponents:
     pair_distortion_jacobian: Array
     distortion_information: Array
     distortion_vector: Array
-    distortion_weight: Array
     distortion_size: float | Array = 1.0
     robust_scale: float = np.inf
 
@@ -87,14 +84,6 @@ class VarianceRatios:
 
 def least_cost_of_distortion(parts: VarianceComponents) -> float:
     """Twice the error of both factors of the distortion by itself, at its minimum."""
-    information, vector, constant = shown_distortion(parts)
+    vector = parts.distortion_vector
     prior = np.diag(1.0 / np.broadcast_to(parts.distortion_size, len(vector)))
-    return constant - float(vector @ np.linalg.solve(prior + information, vector))
-
-
-def shown_distortion(parts: VarianceComponents) -> tuple[Array, Array, float]:
-    """(B, B) information, (B,) vector and constant by the residuals of all places."""
-    weight = parts.distortion_weight
-    information = np.einsum("pn,pnij->ij", weight, parts.distortion_information)
-    vector = np.einsum("pn,pni->i", weight, parts.distortion_vector)
-    return information, vector, float(vector @ np.linalg.pinv(information) @ vector)
+    return -float(vector @ np.linalg.solve(prior + parts.distortion_information, vector))

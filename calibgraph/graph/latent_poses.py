@@ -32,9 +32,8 @@ from calibgraph.arrays import Array
 from calibgraph.graph.by_place import (
     BlockByPlace,
     PairByPlace,
-    QuadraticByPlace,
 )
-from calibgraph.graph.components import EXACT, VarianceComponents, shown_distortion
+from calibgraph.graph.components import EXACT, VarianceComponents
 from calibgraph.graph.lens import LensTerm, lens_graph
 from calibgraph.graph.objective import join
 from calibgraph.graph.variables import (
@@ -54,11 +53,8 @@ from calibgraph.model.config import Reported
 from factors import (
     displaced_between_factor,
     placed_factor,
-    robust_noise,
     to_runs,
 )
-
-Data = BlockByPlace | QuadraticByPlace
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +63,7 @@ class LatentPoseModel:
 
     Attributes:
         cameras: their names.
-        blocks: correspondences, per camera that has some, or the quadratics that are left of them.
+        blocks: correspondences, per camera that has some.
         pairs: camera-to-camera matches.
         pose_graph: priors and measured relative poses, on ``x_c``; marginals of places that are
             not in the graph, on ``o`` and ``m_c``.
@@ -81,7 +77,7 @@ class LatentPoseModel:
     """
 
     cameras: tuple[str, ...]
-    blocks: Mapping[str, Data]
+    blocks: Mapping[str, BlockByPlace]
     pairs: Sequence[PairByPlace]
     pose_graph: gtsam.NonlinearFactorGraph
     components: VarianceComponents
@@ -279,15 +275,11 @@ def latent_pose_graph(model: LatentPoseModel) -> gtsam.NonlinearFactorGraph:
 
 
 def data_graph(model: LatentPoseModel) -> gtsam.NonlinearFactorGraph:
-    """One factor per camera and place, and one per pair and place; lossless.
-
-    A summary of earlier correspondences is another factor of its camera and place.
-    """
+    """One factor per camera and place, and one per pair and place; lossless."""
     graph = gtsam.NonlinearFactorGraph()
     for place, camera in model.matched_places:
         keys = [cloud_at_key(place), matched_at_key(place, camera), *model.lens_keys(camera)]
-        for factor in model.blocks[model.cameras[camera]].factors(place, keys):
-            graph.add(factor)
+        graph.add(model.blocks[model.cameras[camera]].factor(place, keys))
     for pair in model.pairs:
         key_a, key_b = (paired_key(model.cameras.index(name)) for name in (pair.a, pair.b))
         for place, (first, end) in zip(pair.places.tolist(), to_runs(pair.edges), strict=True):
@@ -316,10 +308,9 @@ def _distortion_graph(parts: VarianceComponents) -> gtsam.NonlinearFactorGraph:
     graph, size = gtsam.NonlinearFactorGraph(), parts.distortion_jacobian.shape[2]
     noise = gtsam.noiseModel.Diagonal.Variances(np.broadcast_to(parts.distortion_size, size))
     graph.add(gtsam.PriorFactorVector(DISTORTION, np.zeros(size), noise))
-    information, vector, constant = shown_distortion(parts)
-    zero = gtsam.Values()
+    zero, quadratic = gtsam.Values(), (parts.distortion_information, parts.distortion_vector)
     zero.insert(DISTORTION, np.zeros(size))
-    shown = gtsam.HessianFactor(DISTORTION, information, vector, constant)
+    shown = gtsam.HessianFactor(DISTORTION, *quadratic, 0.0)
     graph.add(gtsam.LinearContainerFactor(shown, zero))
     return graph
 
@@ -330,4 +321,5 @@ def _noise(covariance: Array) -> gtsam.noiseModel.Gaussian:
 
 def _robust(covariance: Array, scale: float) -> gtsam.noiseModel.Base:
     noise = _noise(covariance)
-    return noise if np.isinf(scale) else robust_noise(noise, loss="geman_mcclure", scale=scale)
+    loss = gtsam.noiseModel.mEstimator.GemanMcClure.Create(scale)
+    return noise if np.isinf(scale) else gtsam.noiseModel.Robust.Create(loss, noise)

@@ -28,7 +28,7 @@ from calibgraph.model.clock import clock_of
 from calibgraph.model.config import LensPart
 from calibgraph.model.lens import IN_DOUBT, LensSigmas
 from calibgraph.model.rig import Camera, Rig
-from factors import Columns, linear_factor, robust_noise
+from factors import Columns, cauchy_noise, linear_factor
 from factors.columns import CENTRE_X, CENTRE_Y, CLOCK, COEFFICIENT_NUMBERS, FOCAL, OFFSET, READOUT
 from factors.lens_kernels import EQUIRECTANGULAR, PINHOLE
 
@@ -166,7 +166,7 @@ class LensTerm:
 def lens_graph(lenses: Mapping[int, LensTerm], *, is_distorted: bool) -> gtsam.NonlinearFactorGraph:
     """Priors of the lenses, and from each to where its matches show it."""
     graph = gtsam.NonlinearFactorGraph()
-    tail = robust_noise(gtsam.noiseModel.Unit.Create(1), loss="cauchy", scale=_TAIL_SIGMAS)
+    tail = cauchy_noise(gtsam.noiseModel.Unit.Create(1), _TAIL_SIGMAS)
     for number, term in lenses.items():
         unit = np.eye(len(term.variable.free))
         for row in unit:

@@ -13,6 +13,8 @@ l_c   the lens of camera c, if it is estimated, in standard deviations of its pr
 s_c   that lens as its matches show it
 """
 
+from collections.abc import Callable
+
 import gtsam
 
 CLOUD = int(gtsam.symbol("o", 0))
@@ -22,44 +24,17 @@ MOST_CAMERAS = 1000
 """``a3002`` is camera 2 at place 3."""
 
 
-def camera_key(camera: int) -> int:
-    """Key of ``x_c``."""
-    return int(gtsam.symbol("x", camera))
+Key = Callable[[int], int]
 
 
-def aligned_key(camera: int) -> int:
-    """Key of ``y_c``."""
-    return int(gtsam.symbol("y", camera))
+def _keys_of(letter: str) -> Key:
+    """From the number of a camera or place to the key of its variable."""
+    return lambda number: int(gtsam.symbol(letter, number))
 
 
-def body_key(camera: int) -> int:
-    """Key of ``b_c``."""
-    return int(gtsam.symbol("b", camera))
-
-
-def matched_key(camera: int) -> int:
-    """Key of ``m_c``."""
-    return int(gtsam.symbol("m", camera))
-
-
-def paired_key(camera: int) -> int:
-    """Key of ``n_c``."""
-    return int(gtsam.symbol("n", camera))
-
-
-def lens_key(camera: int) -> int:
-    """Key of ``l_c``."""
-    return int(gtsam.symbol("l", camera))
-
-
-def seen_lens_key(camera: int) -> int:
-    """Key of ``s_c``."""
-    return int(gtsam.symbol("s", camera))
-
-
-def cloud_at_key(place: int) -> int:
-    """Key of ``o_p``."""
-    return int(gtsam.symbol("p", place))
+camera_key, aligned_key, body_key, matched_key = map(_keys_of, "xybm")
+paired_key, lens_key, seen_lens_key, cloud_at_key = map(_keys_of, "nlsp")
+"""Of ``x_c``, ``y_c``, ``b_c``, ``m_c``, ``n_c``, ``l_c``, ``s_c`` and ``o_p``."""
 
 
 def matched_at_key(place: int, camera: int) -> int:

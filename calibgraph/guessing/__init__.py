@@ -1,1 +1,1 @@
-"""A rig for a calibration to begin with, from words, from frames of a URDF, or from nothing."""
+"""A rig for a calibration to begin with, from words, or from frames of a URDF."""

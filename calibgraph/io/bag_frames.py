@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
@@ -13,8 +15,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from calibgraph.arrays import Array
-from calibgraph.errors import DatasetError
-from calibgraph.io.bags.camera_info import LensStates, same_lens
+from calibgraph.errors import DatasetError, FileError
+from calibgraph.io.bags.camera_info import StatedLens, lens_of
 from calibgraph.io.bags.messages import Bag, open_drive, read_message
 from calibgraph.io.bags.point_clouds import doubtful_time_fields
 from calibgraph.io.bags.stamps import (
@@ -38,7 +40,6 @@ from calibgraph.io.bags.transforms import (
 )
 from calibgraph.io.clouds import time_fields
 from calibgraph.io.frame import Frame, ScanMotion, seconds_between, twist_between, twist_by_scans
-from calibgraph.io.lenses import CameraLens
 from calibgraph.model.geometry import transform
 from calibgraph.model.rig import Camera
 
@@ -200,7 +201,7 @@ def frames_of_bag(
     bag = Bag(path)
     topics = choose_topics(bag, options.topics, [*cameras], lidars=lidars)
     images = topics.paired
-    stamps, lenses = _read(bag, topics, options)
+    stamps, others = _read(bag, topics, options)
     clouds = stamps[topics.lidar]
     tolerance_ns = round(options.sync_tolerance_s * _S)
     pairs = {n: nearest(clouds, stamps[topic], tolerance_ns) for n, topic in images.items()}
@@ -208,10 +209,10 @@ def frames_of_bag(
     summary = _summary(stamps, topics, pairs, complete, options=options)
     if not len(complete):
         raise DatasetError(f"{path}: {summary}; {_advice(stamps, topics, pairs)}")
-    for name, states in lenses.items():
-        record_ns = np.array(stamps[images[name]].record_ns)[pairs[name][complete]]
-        fits, note = _with_lens_of_rig(cameras[name], states, record_ns)
-        complete, summary = complete[fits], summary + (note and f"; {name}: {note}")
+    summary += "".join(
+        f"; {name}: {count} camera_info have another lens than the first: choose frames of one lens"
+        for name, count in others.items() if count
+    )  # fmt: skip
     _, cells = np.unique(np.array(clouds.cells)[complete], return_inverse=True)
     recorded = tuple(
         Frame(
@@ -240,50 +241,20 @@ def frames_of_bag(
 
 def _read(
     bag: Bag, topics: RigTopics, options: BagOptions
-) -> tuple[dict[str, TopicStamps], dict[str, LensStates]]:
-    """The stamps of clouds and images by topic, and the lenses by camera."""
+) -> tuple[dict[str, TopicStamps], Counter[str]]:
+    """The stamps of clouds and images by topic, and how many lenses of a camera are other ones."""
     stamps = {t: TopicStamps() for t in (topics.lidar, *topics.paired.values())}
-    infos = {name: c for name, c in topics.cameras.items() if c.info and bag.has(c.info)}
-    lenses = {
-        name: LensStates(f"{bag.path}: {c.info}", rectified=c.rectified)
-        for name, c in infos.items()
-    }
-    of_info = {c.info: lenses[name] for name, c in infos.items()}
-    beside = [info for info in of_info if info]
-    for cell, message in read_messages(bag, [*stamps], options.every_s, beside):
+    infos = {c.info: (n, c) for n, c in topics.cameras.items() if c.info and bag.has(c.info)}
+    first, others = dict[str, StatedLens](), Counter[str]()
+    for cell, message in read_messages(bag, [*stamps], options.every_s, infos):
         if message.topic in stamps:
             stamps[message.topic].add(message, cell, bag, options.stamps)
-        else:
-            of_info[message.topic].add(message.content, message.record_ns)
-    return stamps, lenses
-
-
-def _with_lens_of_rig(
-    camera: Camera, states: LensStates, record_ns: Rows
-) -> tuple[NDArray[np.bool_], str]:
-    """(n,) which images, by their times of recording, have the lens of the rig; and a note.
-
-    All do if no CameraInfo has it: then the rig's is from elsewhere.
-    """
-    size_px = camera.width_px, camera.height_px
-    own = CameraLens(camera.model, size_px, camera.intrinsics_px, camera.distortion)
-    first = next((each for each in states.lenses if same_lens(each.lens, own)), None)
-    fits = np.ones(len(record_ns), bool)
-    if first is not None:
-        fits = np.array([each.agrees(first) for each in states.lenses])[states.which(record_ns)]
-    notes = [f"{states.without} camera_info have no lens"] * bool(states.without)
-    if states.lenses[1:]:
-        one, two = states.lenses[:2]
-        notes.append(
-            f"its camera_info changes at {states.since_ns[1] / _S:.3f} s (recorded), from "
-            f"{one.in_words()} to {two.in_words()}"
-        )
-    if not fits.all():
-        notes.append(
-            f"{np.sum(~fits)} frames with another lens than the rig's are left out; calibrate them "
-            "with a rig that has their lens (--rig)"
-        )
-    return fits, "; ".join(notes)
+            continue
+        name, camera = infos[message.topic]
+        with suppress(FileError):  # some drivers begin with zeros
+            lens = lens_of(message.content, f"{bag.path}", rectified=camera.rectified)
+            others[name] += not lens.agrees(first.setdefault(name, lens))
+    return stamps, others
 
 
 def _note(clouds: TopicStamps, motion: Motion) -> str:

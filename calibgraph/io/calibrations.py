@@ -1,19 +1,19 @@
 """Results from disk: the YAML file of a calibration, and the table beside it."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, BeforeValidator, StrictBool
+from pydantic import AfterValidator, AliasPath, BaseModel, BeforeValidator, Field, StrictBool
 
 from calibgraph.arrays import Array
 from calibgraph.errors import FileError
 from calibgraph.files import checked_model, holds_truth_value, load_model, read_yaml, sha256
 from calibgraph.io.tables import load_camera_matches, load_correspondences
 from calibgraph.model.calibration import Calibration, Residuals
-from calibgraph.model.config import Config, Terms
+from calibgraph.model.config import FORMER_SETTINGS, Config, Reported, Terms
 from calibgraph.model.error_sources import ErrorSources
 from calibgraph.model.lens import LensEstimate, joint_parameters
 from calibgraph.model.result_files import (
@@ -32,7 +32,7 @@ _POSE = 6  # numbers of one
 _LARGEST = 1e24  # of a covariance: that of a pose that nothing determines is smaller
 _MEASURED = (
     "timings_s", "residuals", "rounds", "prior_share", "error_sources", "lens", "covariance",
-    "joint_covariance", "pair_covariance", "bootstrap_covariance", "lens_covariance", "sigmas",
+    "joint_covariance", "pair_covariance", "lens_covariance", "sigmas",
 )  # fmt: skip
 _ROUNDING = 1e-6  # of correlations: other programs may write fewer digits
 
@@ -54,13 +54,14 @@ def load_calibration(path: Path | str) -> Calibration:
     for key in _MEASURED:
         _require_possible(content.get(key), f"{path}: {key}")
     parts = checked_model(_Parts, content, path)
+    former = FORMER_SETTINGS.items()
+    settings = {key: value for key, value in parts.config.items() if (key, value) not in former}
     found = Calibration(
         rig=checked_model(Rig, parts.rig, path),
         initial_rig=checked_model(Rig, parts.initial_rig, path),
-        config=checked_model(Config, parts.config, path),
+        config=checked_model(Config, settings, path),
         camera_verdicts=_verdicts(parts.camera_verdicts),
         lidar_verdicts=_verdicts(parts.lidar_verdicts),
-        bootstrap=parts.bootstrap_covariance,
         lens_covariance={name: of.covariance for name, of in parts.lens_covariance.items()},
         frames=tuple(frame.model_dump(exclude_none=True) for frame in parts.frames_used),
         correspondences=_table(path, CORRESPONDENCES_FILE, content, load_correspondences),
@@ -158,7 +159,6 @@ class _Parts(BaseModel):
     covariance: dict[str, Covariance | None]
     joint_covariance: JointCovariance | None
     pair_covariance: dict[str, Covariance]
-    bootstrap_covariance: dict[str, Covariance]
     stage1_T_camera_lidar: dict[str, Matrix4]
     camera_verdicts: dict[str, _Checks]
     lidar_verdicts: dict[str, _Checks] = {}
@@ -230,8 +230,7 @@ def _is_whole(sigmas: Any, camera: str) -> bool:
 
 _OF_ALL_CAMERAS = ("covariance", "camera_verdicts", "counts")
 _OF_SOME_CAMERAS = (
-    "residuals", "stage1_T_camera_lidar", "weaknesses", "prior_share", "bootstrap", "error_sources",
-    "lens",
+    "residuals", "stage1_T_camera_lidar", "weaknesses", "prior_share", "error_sources", "lens",
 )  # fmt: skip
 _OTHERWISE = {
     "rig",
@@ -265,41 +264,33 @@ def is_calibration(content: Mapping[str, Any]) -> bool:
     return content.get("format") == CALIBRATION_FORMAT
 
 
-class _Sources(BaseModel):
-    """The keys of a result's file that hold hashes of what it was made from."""
+class StatedResult(BaseModel):
+    """Keys of a result's file that are read without the rest of it."""
 
     inputs: dict[str, str] = {}
     correspondences_sha256: str | None = None
-
-
-def is_made_from(path: Path, hashes: Iterable[str]) -> bool:
-    """Whether a rig's file is a result that was made from a source of one of these SHA-256."""
-    if not is_calibration_file(path):
-        return False
-    sources = load_model(_Sources, path)
-    return not {sources.correspondences_sha256, *sources.inputs.values()}.isdisjoint(hashes)
-
-
-class _ErrorBars(BaseModel):
-    """The keys of a result's file that hold its error bars."""
-
     covariance: dict[str, Covariance | None] = {}
     error_bar_holds: dict[str, StrictBool] = {}
+    status: Status | None = Field(None, validation_alias=AliasPath("verdict", "status"))
+    of: Reported = Field("alignment", validation_alias=AliasPath("config", "of"))
+
+    @property
+    def hashes(self) -> set[str | None]:
+        """SHA-256 of all that it was made from."""
+        return {self.correspondences_sha256, *self.inputs.values()}
+
+    @property
+    def error_bars(self) -> dict[str, Array | None]:
+        """Per camera, its (6, 6) covariance; None for one that does not hold."""
+        return {
+            name: covariance if self.error_bar_holds.get(name) else None
+            for name, covariance in self.covariance.items()
+        }
 
 
-def error_bars(path: Path) -> dict[str, Array | None] | None:
-    """Per camera of a result, its (6, 6) covariance; None for one that does not hold.
-
-    Returns:
-        None if the file is no result.
-    """
-    if not is_calibration_file(path):
-        return None
-    found = load_model(_ErrorBars, path)
-    return {
-        name: covariance if found.error_bar_holds.get(name) else None
-        for name, covariance in found.covariance.items()
-    }
+def stated_result(path: Path) -> StatedResult | None:
+    """What the file of a rig states if it is a result; None if it is none."""
+    return load_model(StatedResult, path) if is_calibration_file(path) else None
 
 
 def _require_whole(content: Mapping[str, Any], path: Path) -> None:

@@ -31,12 +31,10 @@ from calibgraph.io.dataset_folders import folder_layout, frames_of_folder, publi
 from calibgraph.io.frame import Frame, Kept, twist_by_scans
 from calibgraph.io.frame_files import way_out
 from calibgraph.io.rigs import describe_rig, read_rig
-from calibgraph.memory import available_bytes
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.parallel import KeyedCache
 
 Item = TypeVar("Item")
-_BYTES_PER_PIXEL = 24  # of an image: BGR, gray, gradients and depths of a frame
 
 LEAST_INTERVAL_S, MOST_INTERVAL_S = 0.005, 10.0
 
@@ -168,21 +166,9 @@ def _without_frames(paths: tuple[Path, ...], rig: Rig | None, bag: BagOptions) -
     for path, (other, _) in zip(paths, read, strict=True):
         _require_same_lenses(paths[0], first, path, other)
     notes = [note for _, of_source in read for note in of_source]
-    _require_memory(paths[0], first)
     if rig is None and is_bag(paths[0]):
         notes = [*describe_rig(first), *doubtful_axes(first), *notes]
     return Dataset(rig=first, frames=(), folders=paths, notes=tuple(dict.fromkeys(notes)))
-
-
-def _require_memory(path: Path, rig: Rig) -> None:
-    """Check that one image of each camera fits into memory, in all forms that matching holds."""
-    pixels = sum(camera.width_px * camera.height_px for camera in rig.cameras.values())
-    if (needed := pixels * _BYTES_PER_PIXEL) > (free := available_bytes()):
-        raise DatasetError(
-            f"{path}: the images of its {len(rig.cameras)} cameras have {pixels / 1e6:.0f} million "
-            f"pixels together, which take {needed / 2**30:.1f} GB to match, and {free / 2**30:.1f} "
-            "GB are free; scale images and intrinsics down, or calibrate fewer cameras at once"
-        )
 
 
 def _frames_of_files(

@@ -127,8 +127,7 @@ def find_mounts(
 ONLY_CAMERA = ""
 """The name of a camera whose file states none; there is only one such camera."""
 
-RELATIVE_SIGMA_DEG = 0.1
-RELATIVE_SIGMA_CM = 0.5
+_RELATIVE_SIGMAS = math.radians(0.1), 0.005
 """Assumed of relative poses whose file has none: a stereo calibration with a board, generously."""
 
 
@@ -157,7 +156,6 @@ class RigParts:
         lidar: the LiDAR's frame; None if the file does not name it.
         notes: what was assumed or left out, a line each.
         why_missing: by camera of a bag without T_camera_lidar, the error.
-        why_untied: why the cameras' relative poses cannot be taken as measured; empty if they can.
     """
 
     path: Path
@@ -170,7 +168,6 @@ class RigParts:
     lidar: str | None = None
     notes: tuple[str, ...] = ()
     why_missing: Mapping[str, str] = field(default_factory=dict)
-    why_untied: str = ""
 
     @property
     def is_empty(self) -> bool:
@@ -209,12 +206,9 @@ class RigParts:
         extrinsics: Mapping[str, Array] | None = None,
         *,
         size_px: tuple[int, int] | None = None,
-        relative_sigma_deg: float = RELATIVE_SIGMA_DEG,
-        relative_sigma_cm: float = RELATIVE_SIGMA_CM,
     ) -> Rig:
         """The rig, with further (4, 4) T_camera_lidar, which replace the files'."""
         T = {**self.T_camera_lidar, **(extrinsics or {})}
-        sigmas = math.radians(relative_sigma_deg), relative_sigma_cm / 100.0
         content: dict[str, Any] = {
             "lidar": self.lidar,
             "cameras": {
@@ -231,8 +225,8 @@ class RigParts:
                     "a": pair.a,
                     "b": pair.b,
                     "T_a_b": pair.T_a_b,
-                    "rotation_sigma_rad": pair.rotation_sigma_rad or sigmas[0],
-                    "translation_sigma_m": pair.translation_sigma_m or sigmas[1],
+                    "rotation_sigma_rad": pair.rotation_sigma_rad or _RELATIVE_SIGMAS[0],
+                    "translation_sigma_m": pair.translation_sigma_m or _RELATIVE_SIGMAS[1],
                 }
                 for pair in self.relative_poses
             ],

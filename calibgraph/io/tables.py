@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.errors import CorrespondenceError, FileError
-from calibgraph.files import require_file, wide_encoding
+from calibgraph.files import require_file
 from calibgraph.model.camera_matches import COLUMNS, FORMAT, NAMES, NUMBERS, PLANES, CameraMatches
 from calibgraph.model.correspondences import (
     COORDINATES,
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 
-_PART_ROWS = 2**18
 _FEW_ROWS, _FEW_BYTES, _MOST_RATIO = 2**20, 2**26, 64
 """What any file may hold, and how many times its bytes otherwise: a row of five random coordinates
 takes 12 bytes and more, however packed."""
@@ -52,35 +51,6 @@ def load_correspondences(path: Path | str) -> Correspondences:
         raise FileError(path, str(error)) from error
 
 
-def parts_of_table(path: Path) -> Iterator[Correspondences]:
-    """A table in parts, in order: of Parquet some rows at a time; a CSV file whole.
-
-    Of Parquet the bytes of one row group are in memory: about a million rows, by most writers.
-    """
-    rows = 0
-    for part in _arrow_parts(require_file(path)):
-        try:
-            yield from_arrow(part)
-        except CorrespondenceError as error:
-            raise FileError(path, str(error.after(rows))) from error
-        rows += len(part)
-    require_rows(path, rows)
-
-
-def _arrow_parts(path: Path) -> Iterator[pa.Table]:
-    import pyarrow as pa
-
-    if path.suffix == ".csv":
-        yield read_arrow(path)
-        return
-    # One row group after the other: a reader keeps in memory all that it has read of a group.
-    with arrow_reads(path), open_parquet(path) as file:
-        metadata = file.schema_arrow.metadata
-        for group in range(file.num_row_groups):
-            for batch in file.iter_batches(_PART_ROWS, row_groups=[group]):
-                yield pa.Table.from_batches([batch]).replace_schema_metadata(metadata)
-
-
 def read_arrow(
     path: Path, names: Sequence[str] = ("camera",), types: Mapping[str, str] | None = None
 ) -> pa.Table:
@@ -99,11 +69,9 @@ def read_arrow(
 
 
 def _require_commas(path: Path) -> None:
-    """Check the encoding of a CSV file, and what separates the columns of its first line."""
+    """Check what separates the columns of a CSV file, by its first line."""
     with path.open("rb") as file:
         head = file.readline(2**16)
-    if encoding := wide_encoding(head):
-        raise FileError(path, f"is {encoding}; save it as UTF-8 (in Excel: CSV UTF-8)")
     for separator, name in ((b";", "semicolons"), (b"\t", "tabs")):
         if separator in head and b"," not in head:
             raise FileError(

@@ -16,8 +16,7 @@ import gtsam
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.file_sets import written_together
-from calibgraph.files import sha256, write_yaml
+from calibgraph.files import sha256, write_yaml, written_together
 from calibgraph.model import geometry, result_files
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config, Terms
@@ -133,8 +132,6 @@ class Calibration:
         lens: per camera whose lens was estimated, its parameters; the lens itself is the rig's.
         lens_covariance: per camera of ``lens``, (6 + k, 6 + k) of xi and of its parameters in their
             order and units, as ``joint_parameters(lens[name])`` names them.
-        bootstrap: of ``Config(bootstrap=N)``: per camera, (6, 6) scatter over N draws of frames,
-            with replacement, like ``covariance``, as a check of it.
         frames: of ``calibrate``: per frame its ``frame`` number, ``name``, ``cloud`` file, and
             ``images``, a file per camera.
         moves: of ``track``: what moved, since when, how far, in words.
@@ -167,7 +164,6 @@ class Calibration:
     error_sources: Mapping[str, ErrorSources] = field(default_factory=dict)
     lens: dict[str, tuple[LensEstimate, ...]] = field(default_factory=dict)
     lens_covariance: dict[str, Array] = field(default_factory=dict)
-    bootstrap: dict[str, Array] = field(default_factory=dict)
     frames: tuple[dict[str, Any], ...] = ()
     moves: tuple[str, ...] = ()
     places: Groups = ()
@@ -351,7 +347,6 @@ class Calibration:
             "covariance_of": TANGENT_SENTENCE,
             "pair_covariance_of": PAIR_TANGENT_SENTENCE,
             "lens_covariance": {name: self.joint_of_lens(name) for name in self.lens_covariance},
-            "bootstrap_covariance": self.bootstrap,
             "frames_used": self.frames,
         }
         return {key: content[key] if key in content else getattr(self, key) for key in _KEYS}
@@ -362,7 +357,7 @@ _KEYS = (
     "prior_share", "error_sources", "frames", "T_camera_lidar", "sigmas", "error_bar_holds", "rig",
     "covariance_of", "covariance", "joint_names", "joint_covariance", "pair_covariance_of",
     "pair_covariance",
-    "lens", "lens_covariance", "bootstrap_covariance", "residuals", "counts", "frames_used",
+    "lens", "lens_covariance", "residuals", "counts", "frames_used",
     "moves", "places", "rounds", "warnings", "initial_rig", "stage1_T_camera_lidar", "terms",
     "config", "timings_s", "inputs", "versions", "date",
 )  # fmt: skip

@@ -114,7 +114,7 @@ CAUSES: dict[str, Cause] = {
     ),
     "frames": Cause(
         _FRAMES,
-        {"outlier_frames": "", "place_distance": "", "place_inliers": "", "bootstrap_sigma": "",
+        {"outlier_frames": "", "place_distance": "", "place_inliers": "",
          "disagreeing_frames": "Check whether the camera was moved.",
          "drift": "Check whether the camera's mount is loose."},
     ),
@@ -147,8 +147,7 @@ CAUSES: dict[str, Cause] = {
         "",
         {"free": "Give correspondences over the whole image, and at several distances.",
          "no_error_bar": "Mend the camera whose pose is free, or leave it out.",
-         "sigma_rotation": "", "sigma_translation": "", "flat_evidence": "", "went_on": _STRUCTURE,
-         "beyond_tolerance": _STRUCTURE},
+         "sigma_rotation": "", "sigma_translation": "", "flat_evidence": "", "went_on": _STRUCTURE},
     ),
     "other": Cause("", {}),  # of another version
 }

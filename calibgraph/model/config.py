@@ -6,11 +6,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
-from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import BeforeValidator, ConfigDict, Field, ValidationError
 
 from calibgraph.files import StrictNumbers, checked_model, describe, read_yaml
 from calibgraph.model.verdict import TOLERANCE
-from factors import LossName
 
 Terms = Literal["stage1", "reprojection", "priors", "full"]
 TERMS: tuple[Terms, ...] = get_args(Terms)
@@ -21,7 +20,7 @@ LensPart = Literal["focal", "centre", "distortion", "offset", "readout"]
 
 Pixels = Annotated[float, Field(ge=1e-6, le=1e6)]
 Weight = Annotated[float, Field(ge=0, le=1e12)]
-Cells = Annotated[int, Field(gt=0, le=100_000)]
+Cells = Annotated[int, Field(gt=0, le=1000)]
 Seed = Annotated[int, Field(ge=0, lt=2**31)]
 
 
@@ -52,12 +51,6 @@ class Tracking(StrictNumbers):
     blind_frames: Annotated[int, Field(ge=2, le=100_000)] = 20
 
 
-def _not_one(draws: int) -> int:
-    if draws == 1:
-        raise ValueError("one draw has no scatter; give 0 for none, or at least 2")
-    return draws
-
-
 def _lens_parts(value: Any) -> Any:
     """The names of parts, also with commas between them; ``lens`` and ``clock`` stand for more."""
     names = [*map(str.strip, value.split(","))] if isinstance(value, str) else value
@@ -78,8 +71,7 @@ class Config(StrictNumbers):
         preset: the preset these settings started from.
         prior_weight: lambda, the per-camera prior's weight.
         relative_prior_weight: mu, the relative-pose prior's weight.
-        loss: name of the robust loss.
-        loss_scale_px: delta. None: from the residuals' own spread, per camera.
+        loss_scale_px: delta of Cauchy's loss. None: from the residuals' own spread, per camera.
         gate_px: tau, on the unweighted reprojection error. None: from the residuals' spread.
         confidence_min: c_min.
         confidence_weights: weigh residuals by sqrt(clip(c, 0.1, 1)), else uniformly.
@@ -97,8 +89,6 @@ class Config(StrictNumbers):
         tolerance_cm: distance by which a camera may be off: the verdict is about more.
         common_deg, common_cm: standard deviation per camera axis of the error that all frames of a
             table share, if the table does not state it; 0 if they share none.
-        bootstrap: how many draws of frames, with replacement, whose scatter checks the
-            covariance; 0 for none.
         of: the poses that are reported: ``alignment``, where the points, as this LiDAR delivers
             them, meet the images; or ``mount``, where the sensors are, with a wider error bar.
         estimate: parts of each lens that are estimated with the extrinsics, by ``calibrate`` and
@@ -114,7 +104,6 @@ class Config(StrictNumbers):
     preset: PresetName = "auto"
     prior_weight: Weight = 1.0
     relative_prior_weight: Weight = 5.0
-    loss: LossName = "cauchy"
     loss_scale_px: Pixels | None = None
     gate_px: Pixels | None = None
     confidence_min: Annotated[float, Field(ge=0, le=1)] = 0.1
@@ -130,7 +119,6 @@ class Config(StrictNumbers):
     tolerance_cm: Annotated[float, Field(gt=0, le=1e6)] = TOLERANCE[1]
     common_deg: Annotated[float, Field(ge=0, le=180)] | None = None
     common_cm: Annotated[float, Field(ge=0, le=10_000)] | None = None
-    bootstrap: Annotated[int, Field(ge=0, le=100_000), AfterValidator(_not_one)] = 0
     of: Reported = "alignment"
     estimate: Annotated[tuple[LensPart, ...], BeforeValidator(_lens_parts)] = ()
     seed: Seed = 0
@@ -174,6 +162,8 @@ _PRESETS: dict[str, dict[str, Any]] = {
         "learnt_weights": False,
     },
 }
+FORMER_SETTINGS = {"loss": "cauchy", "bootstrap": 0}
+"""Those of results of earlier versions with the values that are the only ones now."""
 PRESETS: tuple[PresetName, ...] = get_args(PresetName)
 
 

@@ -20,10 +20,10 @@ START = "start"
 COMMON_ERROR = "common_error"
 """Kind of the check that a table states the error that its frames share."""
 ABOUT_THE_DATA = frozenset({
-    COMMON_ERROR, START, "beyond_tolerance", "copies", "correspondences", "correspondences_used",
-    "difference between even and odd frames", "failed_frames", "focal_sensitivity", "frames",
-    "image evidence", "images", "lidar_instants", "lidar_loose", "lidar_start", "no_error_bar",
-    "prior_share", "repeated_frames", "sigma_rotation", "sigma_translation", "terms", "went_on",
+    COMMON_ERROR, START, "copies", "correspondences", "correspondences_used",
+    "failed_frames", "frames", "image evidence", "images", "lidar_instants", "lidar_loose",
+    "lidar_start", "no_error_bar", "prior_share", "repeated_frames", "sigma_rotation",
+    "sigma_translation", "terms", "went_on",
 })  # fmt: skip
 """Kinds of checks that count data: beyond a limit, nothing seems wrong yet."""
 WENT_ON = "went_on"

@@ -31,11 +31,11 @@ SOLVERS = {
     "iterative": cv2.SOLVEPNP_ITERATIVE, "EPnP": cv2.SOLVEPNP_EPNP, "SQPnP": cv2.SOLVEPNP_SQPNP,
 }  # fmt: skip
 SOLVE = Config(
-    loss="l2", loss_scale_px=1.0, gate_px=1000.0, learnt_weights=False, grid_columns=400,
+    loss_scale_px=1e4, gate_px=1000.0, learnt_weights=False, grid_columns=400,
     grid_rows=400, common_deg=0.0, common_cm=0.0,
 )  # fmt: skip
-"""Plain least squares over all pairs: with a dozen of them a robust loss would hide a wrong one.
-The picker removes it; :attr:`CameraEstimate.left_out_px` shows which it is."""
+"""In effect least squares over all pairs: with a dozen a robust loss would hide a wrong one. The
+picker removes it; :attr:`CameraEstimate.left_out_px` shows which it is."""
 _LINE_M = 0.05  # scatter of the points off a line, below which a camera turns about it
 _WRONG, _WRONG_PX = 5.0, 5.0  # of a left-out pair: times the median, and pixels
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import base64
 import io
-import warnings
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,39 +16,18 @@ if TYPE_CHECKING:
 
 
 WIDTH_IN = 4.4
-_DPI, _PICTURE_DPI = 150, 100
+_DPI = 150
 _PALETTE_SIZE = 96  # colours of a picture; a palette makes it a third as large
 
 
-def new_figure(
-    height_in: float, width_in: float = WIDTH_IN, *, dpi: int = _DPI, layout: Any = None
-) -> Figure:
+def new_figure(height_in: float, width_in: float = WIDTH_IN) -> Figure:
     """An empty figure outside pyplot's global state."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    size = width_in, height_in
-    figure = Figure(figsize=size, dpi=dpi, facecolor="white", layout=layout)
+    figure = Figure(figsize=(width_in, height_in), dpi=_DPI, facecolor="white")
     FigureCanvasAgg(figure)
     return figure
-
-
-def new_picture(width_in: float, height_in: float) -> Figure:
-    """An empty figure for a file of its own, whose panels share the room."""
-    return new_figure(height_in, width_in, dpi=_PICTURE_DPI, layout="constrained")
-
-
-def save_picture(figure: Figure, path: Path) -> None:
-    """Write a figure as PNG, atomically.
-
-    Raises:
-        FileError: if it cannot be written there.
-    """
-    from calibgraph.files import write_atomically
-
-    with warnings.catch_warnings():  # a name in letters that the font lacks: drawn as boxes
-        warnings.filterwarnings("ignore", "Glyph", UserWarning)
-        write_atomically(path, lambda part: figure.savefig(part, format="png"))
 
 
 def image_figure(camera: Camera, right_in: float = 0.1) -> tuple[Figure, Axes]:
@@ -80,11 +57,3 @@ def to_data_uri(figure: Figure) -> str:
     small = rgb.quantize(_PALETTE_SIZE, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
     small.save(buffer, "PNG")
     return f"data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode('ascii')}"
-
-
-def add_legend(axes: Axes, **where: Any) -> None:
-    """Add a legend and a light grid."""
-    axes.grid(color="0.92", linewidth=0.8)
-    axes.set_axisbelow(True)
-    style = {"loc": "upper right", "markerscale": 3, "framealpha": 0.85, **where}
-    axes.legend(fontsize=8, borderpad=0.3, handlelength=1.4, **style)

@@ -15,7 +15,6 @@ from rich.markup import escape
 from rich.table import Table
 
 from calibgraph.model.calibration import FRAMES_SENTENCE, Calibration
-from calibgraph.model.geometry import degrees_and_centimetres
 from calibgraph.model.metrics import Evaluation, PoseError, pose_error
 from calibgraph.model.places import describe_places
 from calibgraph.model.result_files import CALIBRATION_FILE
@@ -190,9 +189,6 @@ def error_bar_table(result: Calibration) -> Table:
     for name in (*result.covariance, *result.pair_covariance):
         sigmas = result.error_bar(name)
         rows.append([name, *(["-"] * 6 if sigmas is None else _per_axis(*sigmas))])
-    for name, covariance in result.bootstrap.items():
-        if result.error_bar_holds(name):
-            rows.append([f"{name} (bootstrap)", *_per_axis(*degrees_and_centimetres(covariance))])
     return make_table("Error bar, along the axes of the camera", rows)
 
 

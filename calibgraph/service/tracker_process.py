@@ -19,8 +19,8 @@ from calibgraph.model.config import config_from
 from calibgraph.report.as_json import finite, result_summary
 from calibgraph.tracking import DurableCalibrator, warm_up_tracker
 from calibgraph.tracking.assessment import json_lines
+from calibgraph.tracking.frames import Item, frames_of_lines, frames_of_table
 from calibgraph.tracking.state import require_poses_alone
-from calibgraph.tracking.streams import Item, frames_of_lines, frames_of_table
 
 Held = dict[Path, DurableCalibrator]
 _ARROW = b"\xff\xff\xff\xff"

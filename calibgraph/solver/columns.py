@@ -156,7 +156,7 @@ def fit_columns(
     near = loss_scale is not None  # elsewhere the second derivative may lead away
     for _ in range(_MAX_ITERATIONS):
         scale = loss_scale or _median_scale(block.block, T_camera_lidar, free, values)
-        sums = block.block.rescale(scale=scale, loss="cauchy").summarize(
+        sums = block.block.rescale(scale=scale).summarize(
             T_camera_lidar[None], runs, free, step=values, curvature=near
         )
         hessian = used = sums.hessian.sum(axis=0) + weak
@@ -233,8 +233,8 @@ class DistortionEvidence:
         jacobian: (6, 3) displacement of their pose by a unit of each distortion.
         hessian: (6, 6) J^T J of all matches plus the weak prior: the weight of ``jacobian`` in a
             mean over several sets of matches.
-        information: (P, 3, 3) of the residuals at each place, if all matches were independent.
-        vector: (P, 3) the information times the distortions that the residuals show.
+        information: (3, 3) of the residuals, if all matches were independent.
+        vector: (3,) the information times the distortions that the residuals show.
         lens_jacobian: (k, 3) displacement of a free lens, likewise; of a fixed one, (0, 3).
     """
 
@@ -243,11 +243,6 @@ class DistortionEvidence:
     information: Array
     vector: Array
     lens_jacobian: Array = field(default_factory=lambda: np.zeros((0, len(DISTORTION))))
-
-    def as_of_one_place(self) -> DistortionEvidence:
-        """The sum over places."""
-        information, vector = self.information.sum(axis=0), self.vector.sum(axis=0)
-        return replace(self, information=information[None], vector=vector[None])
 
 
 def distortion_evidence(
@@ -286,7 +281,7 @@ def distortion_evidence(
     )
     values = np.zeros(len(free))
     values[: len(known)] = 0.0 if lens is None else lens.values
-    squares = some.block.select(order).rescale(scale=scale.loss_scale, sigma=scale.sigma, loss="l2")
+    squares = some.block.select(order).rescale(scale=math.inf, sigma=scale.sigma)
     T = to_T_camera_lidar(T_lidar_camera)[None]
     sums = squares.summarize(T, to_runs(edges), free, values)
     size = 6 + len(known)  # of what follows
@@ -298,9 +293,8 @@ def distortion_evidence(
     left = hessian[:, bends, bends] + turned @ across
     left = left + (across.transpose(0, 2, 1) + turned @ own) @ follow
     pull = sums.gradient[:, bends] + np.einsum("pij,pi->pj", follow[:-1], sums.gradient[:, moves])
-    whole = own[-1] / share + weak
-    jacobian, of_lens = follow[-1, :6], follow[-1, 6:]
-    return DistortionEvidence(jacobian, whole[:6, :6], left[:-1] / share, pull / share, of_lens)
+    whole, shown = own[-1] / share + weak, (left[:-1].sum(axis=0) / share, pull.sum(axis=0) / share)
+    return DistortionEvidence(follow[-1, :6], whole[:6, :6], *shown, follow[-1, 6:])
 
 
 def pair_jacobians(

@@ -46,15 +46,10 @@ def estimate_variance_ratios(linear: Linearization, present: VarianceRatios) -> 
         linear: with the present ratios.
         present: the ratios of its model.
     """
-    evidence, places = squared_displacements(linear), linear.model.places
-    least = ratios_by_evidence(evidence, places=places, present=present)
-    without = {name: one._replace(free=0.0) for name, one in evidence.items()}
-    most = ratios_by_evidence(without, places=places, present=present)
-    if least.is_near(present) and most.is_near(present):  # whatever the data leave open
-        return most
+    evidence = squared_displacements(linear)
     for name, t in undetermined(linear).items():
         evidence[name] = evidence[name]._replace(free=evidence[name].free - t)
-    return ratios_by_evidence(evidence, places=places, present=present)
+    return ratios_by_evidence(evidence, places=linear.model.places, present=present)
 
 
 def ratios_by_evidence(
@@ -126,8 +121,7 @@ def variance_components(
     prior, sigmas = error_components(), np.asarray(findings.bend_sigmas)
     at_place = np.tile(np.eye(6), (places, len(cameras), 1, 1))
     scatter_at_place, jacobian = at_place.copy(), np.zeros((len(cameras), 6, len(sigmas)))
-    shape = places, len(cameras), len(sigmas)
-    vector, information = np.zeros(shape), np.zeros((*shape, shape[2]))
+    vector, information = np.zeros(len(sigmas)), np.zeros((len(sigmas), len(sigmas)))
     for name, (within, evidence) in shown.items():
         number = cameras.index(name)
         at_place[:, number] = within.at_place(findings.place_variance)
@@ -136,8 +130,8 @@ def variance_components(
         if evidence is not None:
             jacobian[number] = evidence.jacobian * sigmas
             weight = 1.0 / within.mean_variance(findings.place_variance)
-            information[:, number] = weight * np.outer(sigmas, sigmas) * evidence.information
-            vector[:, number] = weight * sigmas * evidence.vector
+            information += weight * np.outer(sigmas, sigmas) * evidence.information
+            vector += weight * sigmas * evidence.vector
     of_place = np.square([findings.place_rotation_rad, findings.place_translation_m])
     components = VarianceComponents(
         cloud=np.eye(6),
@@ -150,7 +144,6 @@ def variance_components(
         pair_distortion_jacobian=np.zeros_like(jacobian),
         distortion_information=information,
         distortion_vector=vector,
-        distortion_weight=np.ones(shape[:2]),
         robust_scale=prior.robust_sigmas if places >= prior.robust_places else np.inf,
     )
     return common_error(components, findings.rigid_sigmas, findings.camera_share)

@@ -10,32 +10,26 @@ import gtsam
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.graph.objective import pose_key, relative_pose_graph
+from calibgraph.graph.objective import pose_key
 from calibgraph.model.findings import error_components
 from calibgraph.model.geometry import pose_rows, to_T_lidar_camera
-from calibgraph.solver.pairs import rows_of_pair
 from calibgraph.solver.two_pass import Objective, Scales, Transforms, to_values
 from factors import BlockSums, ProjectionBlock
-from factors.conditioning import sigmas_of_hessian
 
 
 def convex_hessian(hessian: Array, otherwise: Array) -> Array:
     """The Hessian if it is positive definite; few matches near the gate may spoil it."""
-    return hessian if _is_positive_definite(hessian) else otherwise
+    try:
+        np.linalg.cholesky(hessian)
+    except np.linalg.LinAlgError:
+        return otherwise
+    return hessian
 
 
 def positive_part(matrix: Array) -> Array:
     """The positive semidefinite matrix nearest to a symmetric one."""
     values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
     return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
-
-
-def _is_positive_definite(hessian: Array) -> bool:
-    try:
-        np.linalg.cholesky(hessian)
-    except np.linalg.LinAlgError:
-        return False
-    return True
 
 
 def pose_equations(
@@ -51,20 +45,6 @@ def pose_equations(
         rows = np.concatenate([np.r_[pose_rows(number)] for number in numbers])
         hessian[np.ix_(rows, rows)], gradient[rows] = own[0], -own[1]
     return hessian, gradient
-
-
-def robust_hessians(sums: BlockSums) -> Array:
-    """(f, 6, 6) second derivatives of half the robust cost of frames, by their sums.
-
-    Where it is not convex, the reweighted Hessian, which is positive semidefinite.
-
-    Args:
-        sums: with the curvature, of (f) frames.
-    """
-    assert sums.curvature is not None
-    if _is_positive_definite(sums.curvature):
-        return sums.curvature
-    return np.array([*map(convex_hessian, sums.curvature, sums.hessian)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +90,7 @@ class FittedObjective:
 
     @cached_property
     def robust_hessians(self) -> Mapping[str, Array]:
-        """Per camera, (6, 6) as of :func:`robust_hessians`, of all its frames together."""
+        """Per camera, (6, 6) second derivative of half its robust cost; H if that is not convex."""
         return {
             name: convex_hessian(sums.curvature.sum(axis=0), sums.hessian.sum(axis=0))
             for name, sums in self.frame_sums.items()
@@ -132,52 +112,6 @@ PSEUDO_FRAMES = error_components().pseudo_frames
 """Frames that are added with the scatter along each principal direction. A covariance of six
 numbers from few frames is too small for their joint error (its inverse, by (F - 1) / (F - 8) for F
 frames)."""
-
-
-def bootstrap_covariances(at: FittedObjective, draws: int, seed: int) -> dict[str, Array]:
-    """Per camera, (6, 6) scatter of xi in T_camera_lidar = exp(xi) estimate over draws of frames.
-
-    Every draw takes as many frames as there are, with replacement, all cameras of a frame together.
-    Its minimum is that of the quadratics of its frames at the estimate.
-
-    Args:
-        at: the minimum of all frames.
-        draws: how many.
-        seed: of the draws.
-
-    Returns:
-        Empty without draws, or where the terms do not use the correspondences.
-    """
-    if not draws or not at.objective.uses_correspondences:
-        return {}
-    gradients, hessians = _by_frame(at)
-    priors = pose_equations(at.objective.pose_graph, at.cameras, at.T_camera_lidar)[0]
-    priors += np.diag(np.repeat(np.isin(at.cameras, at.held), 6).astype(np.float64))
-    rng, frames = np.random.default_rng(seed), len(gradients)
-    times = rng.multinomial(frames, np.full(frames, 1 / frames), draws).astype(np.float64)
-    drawn = priors + np.tensordot(times, hessians, 1) + 1e-6 * np.eye(priors.shape[0])
-    steps = np.linalg.solve(drawn, -(times @ gradients)[:, :, None])[:, :, 0]
-    scatter = np.atleast_2d(np.cov(steps, rowvar=False))
-    rows = map(pose_rows, range(len(at.cameras)))
-    return {name: scatter[own, own] for name, own in zip(at.cameras, rows, strict=True)}
-
-
-def _by_frame(at: FittedObjective) -> tuple[Array, Array]:
-    """(f, 6 N) gradients and (f, 6 N, 6 N) Hessians of half the cost of each frame."""
-    cameras, blocks, pairs = at.cameras, at.objective.blocks, at.objective.pairs
-    of = [block.frame_numbers for block in blocks.values()] + [pair.frame for pair in pairs]
-    numbers, size = np.unique(np.concatenate(of)), 6 * len(cameras)
-    gradients, hessians = np.zeros((len(numbers), size)), np.zeros((len(numbers), size, size))
-    for name, block in blocks.items():
-        rows, own = np.searchsorted(numbers, block.frame_numbers), pose_rows(cameras.index(name))
-        gradients[rows, own] = at.frame_sums[name].gradient
-        hessians[rows, own, own] = robust_hessians(at.frame_sums[name])
-    for pair in pairs:
-        rows, columns = np.searchsorted(numbers, np.unique(pair.frame)), rows_of_pair(cameras, pair)
-        hessian, gradient = pair.frame_sums(at.T_camera_lidar)
-        gradients[np.ix_(rows, columns)] += gradient
-        hessians[np.ix_(rows, columns, columns)] += hessian
-    return gradients, hessians
 
 
 def with_pseudo_frames(
@@ -216,25 +150,3 @@ def with_pseudo_frames(
 def _along(vectors: Array, matrix: Array) -> Array:
     """(..., n) v^T M v of each column v."""
     return np.asarray((vectors * (matrix @ vectors)).sum(axis=-2))
-
-
-def data_sigmas(at: FittedObjective) -> Array:
-    """Standard deviations if every correspondence were independent.
-
-    A lower bound of the true uncertainty: it shows the directions that the data do not determine.
-    Measured relative poses and camera pairs count, priors do not.
-
-    Returns:
-        (N, 6) standard deviations per camera: rotation [rad], translation [m], in its axes;
-        infinite in directions without information.
-    """
-    objective, cameras, T_camera_lidar = at.objective, at.cameras, at.T_camera_lidar
-    measured = relative_pose_graph(objective.cameras, objective.rig.relative_poses)
-    hessian = pose_equations(measured, cameras, T_camera_lidar)[0]
-    for name, sums in at.frame_sums.items():
-        rows = pose_rows(cameras.index(name))
-        hessian[rows, rows] += sums.hessian.sum(axis=0)
-    for pair in objective.pairs:
-        both = rows_of_pair(cameras, pair)
-        hessian[np.ix_(both, both)] += pair.sums(T_camera_lidar).hessian
-    return sigmas_of_hessian(hessian).reshape(-1, 6)

@@ -120,8 +120,7 @@ def refine_with_error_model(
     if found is None:
         return None, optimum
     found = replace(found, without_priors=free)
-    iterations = optimum.iterations + found.iterations
-    return found, Optimum(found.T_camera_lidar, found.cost, iterations, found.converged)
+    return found, Optimum(found.T_camera_lidar, found.cost, found.converged)
 
 
 def fit_without_priors(
@@ -169,10 +168,6 @@ def fit_errors(at: FittedObjective, findings: MatcherFindings, places: Places) -
     fit = fit_latent_poses(
         model, start_values(model, at.T_camera_lidar), relative_tolerance=_COARSE_TOLERANCE
     )
-    if fit is not None and np.isfinite(prior.robust_scale):  # an outlying place has no evidence
-        weight = fit.linear.weights
-        prior = replace(prior, distortion_weight=weight[:, :1] * weight[:, 1:])
-        model = replace(model, components=prior)
     for _ in range(_ROUNDS):
         found = ratios if fit is None else estimate_variance_ratios(fit.linear, ratios)
         if fit is None or found.is_near(ratios):

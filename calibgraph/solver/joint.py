@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
@@ -41,7 +40,7 @@ _SETTLED = 0.1  # standard deviations: a smaller change of a lens ends the round
 # fmt: off
 def solve_joint(
     rig: Rig,
-    table: Correspondences | Path | str,
+    table: Correspondences,
     config: Config | None = None,
     terms: Terms = "full",
     *,
@@ -56,7 +55,7 @@ def solve_joint(
 
     Args:
         rig: cameras with their initial guess, and measured relative poses.
-        table: correspondences, or the file that holds them.
+        table: correspondences.
         config: settings; the preset ``auto`` if None.
         terms: which terms of Eq. 5 are used.
         pairwise: Stage-1 estimates of the same correspondences, to skip their PnP.
@@ -65,7 +64,7 @@ def solve_joint(
             the rig's lenses, and then in rounds.
 
     Raises:
-        FileError, CorrespondenceError, ValueError: as of :func:`calibgraph.solve`.
+        CorrespondenceError, ValueError: as of :func:`calibgraph.solve`.
     """
     if terms not in TERMS:
         raise ValueError(f"unknown terms {terms!r}; known are {', '.join(TERMS)}")
@@ -147,7 +146,7 @@ def require_in_reach(T_camera_lidar: Transforms) -> None:
 
 def _solve_with_lenses(
     rig: Rig,
-    table: Correspondences | Path | str,
+    table: Correspondences,
     config: Config,
     terms: Terms,
     *,
@@ -209,10 +208,8 @@ def add_camera_pairs(solution: Solution, matches: CameraMatches) -> Solution:
         The same optimum where no pair of cameras has enough in common.
     """
     alone, watch = replace(solution.without_pairs(), camera_matches=matches), Stopwatch()
-    stops = solution.correspondences.places
-    by_stop = replace(matches, frame=stops.merge_stationary(matches.frame))
     with watch("camera_pairs"):
-        refined = refine_with_pairs(alone.fitted, by_stop)
+        refined = refine_with_pairs(alone.fitted, alone.pair_terms, alone.pairs_alone)
         inliers, optimum = refined or (alone.inliers, alone.optimum)
     with watch("error_model"):
         at = FittedObjective(inliers, alone.scales, optimum.T_camera_lidar, alone.held)

@@ -191,7 +191,7 @@ def _in_other_scenes(
     pixels, _ = camera.lens.project(rays)
     at_m = usual_m * np.outer(_SCENES, _DEPTHS).ravel()
     points, pixels = (at_m[:, None, None] * rays).reshape(-1, 3), np.tile(pixels, (len(at_m), 1))
-    scenes, count = ProjectionBlock(camera.lens, points, pixels, loss="l2"), len(_SCENES)
+    scenes, count = ProjectionBlock(camera.lens, points, pixels), len(_SCENES)
     runs = to_runs(np.arange(count + 1) * (len(points) // count))
     poses = np.tile(np.eye(4), (count, 1, 1))
     hessian = scenes.summarize(poses, runs, lens.free, lens.values).hessian

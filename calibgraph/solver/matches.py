@@ -19,7 +19,6 @@ from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import to_T_lidar_camera
 from calibgraph.model.rig import Camera, Rig
-from calibgraph.solver.preprocess import hash_numbers
 from calibgraph.solver.robust import (
     IDENTITY,
     MIN_SIGMA_PX,
@@ -85,11 +84,6 @@ class CameraBlock:
         """(f,) of the correspondences of each frame."""
         return self.frame_edges[1:] - self.frame_edges[:-1]
 
-    @cached_property
-    def point_hashes(self) -> list[int]:
-        """(n,) of the bits of each point."""
-        return hash_numbers(self.block.points_lidar_m)
-
     def sorted_by(self, of_frame: NDArray[np.int64]) -> CameraBlock:
         """The same correspondences in the order of a number of their frames, (f,)."""
         return self.select(np.argsort(np.repeat(of_frame, self.frame_counts), kind="stable"))
@@ -145,21 +139,14 @@ class CameraBlock:
         sizes = whitened_norm(self.block.sqrt_information, residuals) / medians
         return np.where(projectable, sizes_px, np.inf), np.where(projectable, sizes, np.inf)
 
-    def errors_px(self, T_camera_lidar: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """(n,) unweighted errors [px] along constrained directions; (n,) whether projectable."""
-        residuals, projectable = self.block.residuals(to_T_lidar_camera(T_camera_lidar))
-        return constrained_error_px(residuals, self.information), projectable
-
     def without_outliers(self, T_camera_lidar: Array, scale: ResidualScale) -> CameraBlock:
         """The inliers (paper, two-pass solver, step 2): within the gate, and projectable."""
         return self.select(self.within_gate(T_camera_lidar, scale.gate_px))
 
     def within_gate(self, T_camera_lidar: Array, gate_px: float) -> NDArray[np.bool_]:
         """(n,) which are projectable, with an error of at most so many pixels."""
-        if self.information is None:
-            return np.asarray(self.block.run_norms(T_camera_lidar[None])[0] <= gate_px)
-        errors_px, projectable = self.errors_px(T_camera_lidar)
-        return np.asarray(projectable & (errors_px <= gate_px))
+        sizes_px = self.all_sizes(T_camera_lidar[None])[0]
+        return np.asarray(sizes_px <= gate_px / median_norm(self.information))
 
     def best_candidate(self, candidates: Sequence[Array], scale_px: float) -> int:
         """Which of some T_camera_lidar has the least mean Cauchy loss, over an even selection."""
@@ -168,8 +155,6 @@ class CameraBlock:
         sample = self.select_evenly(_MAX_SAMPLE)
         root = None if sample.information is None else constrained_root(sample.information)
         errors = sample.block.rewhiten(root).rescale(scale=scale_px)
-        if errors.loss != "cauchy":
-            errors = replace(errors, loss="cauchy")
         return int(np.argmin(errors.costs_at_each(np.array(candidates))))
 
     def scale(self, T_camera_lidar: Array, config: Config) -> ResidualScale:
@@ -185,7 +170,8 @@ class CameraBlock:
     def _any_projectable(self, T_camera_lidar: Array) -> bool:
         """Whether any correspondence is in front of the camera: mostly, one of the first is."""
         first = self.select(np.arange(min(_FIRST, len(self.frame))))
-        return any(some.errors_px(T_camera_lidar)[1].any() for some in (first, self))
+        sizes = (some.all_sizes(T_camera_lidar[None])[0] for some in (first, self))
+        return any(np.isfinite(each).any() for each in sizes)
 
     @cached_property
     def least_spread(self) -> float:
@@ -225,7 +211,7 @@ def camera_block(camera: Camera, rows: Correspondences, config: Config) -> Camer
     """The preprocessed correspondences of one camera, their points at the times of the pixels."""
     root, motion = sqrt_information(rows, config), motion_of(camera, rows)
     points = at_pixels(camera, rows).points_lidar_m
-    block = ProjectionBlock(camera.lens, points, rows.pixels_px, root, config.loss, motion=motion)
+    block = ProjectionBlock(camera.lens, points, rows.pixels_px, root, motion=motion)
     return CameraBlock(block, rows.information_px, rows.frame)
 
 

@@ -1,14 +1,14 @@
 """What cameras see in common: the last step of the joint solve, and a fit of one pair alone."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.model.camera_matches import CameraMatches
-from calibgraph.model.config import Config
 from calibgraph.model.findings import error_components
 from calibgraph.model.geometry import (
     invert,
@@ -19,12 +19,10 @@ from calibgraph.model.geometry import (
     retract_all,
     twist_between,
 )
-from calibgraph.model.rig import Rig
 from calibgraph.solver.covariance import FittedObjective
 from calibgraph.solver.pairs import (
     ENOUGH_SURFACES,
     PairTerm,
-    pair_terms,
     rows_of_pair,
     usual_excess,
 )
@@ -32,58 +30,58 @@ from calibgraph.solver.pnp import DAMPING
 from calibgraph.solver.two_pass import Objective, Optimum
 from factors import pose_sigmas
 
-_NARROWINGS = 4  # steps from the spread at the estimate to the least one
+_NARROWINGS = 3  # steps at most from the spread at the estimate to the least one, by half each
 _COARSE = 1e-6  # relative change of the error at which each of them stops
 _MAX_STEPS, _MAX_STEP, _CONVERGED = 30, 0.1, 1e-5  # of a pair alone: rad, m
-_NEAR = 1e-4  # the last step where only the spread of residuals is asked for
+_SETTLED, _MOST = 0.005, 9  # relative change of a spread that ends its measuring, and its steps
+Places = Mapping[frozenset[str], Mapping[str, Array]]
 _HELD_RAD, _HELD_M = np.radians(1.0), 0.2  # of the first camera, while its pair is fitted alone
 
 
 def refine_with_pairs(
-    at: FittedObjective, matches: CameraMatches
+    at: FittedObjective, terms: Sequence[PairTerm], alone: Places
 ) -> tuple[Objective, Optimum] | None:
     """Minimize again with the terms of camera pairs, their sigmas narrowed step by step; gate; fit.
 
+    At an estimate that is wrong, residuals are large, and so would be the spread by which they are
+    weighed: a pair could not correct it. So the last sigmas are those where pairs alone place their
+    cameras.
+
     Args:
         at: the minimum without pairs.
-        matches: with surfaces, taken near the optimum.
+        terms: of pairs, with surfaces that are taken near the minimum.
+        alone: by :func:`place_pairs`.
 
     Returns:
         The objective with the pairs' inliers, and its minimum; None where no pair of cameras has
         enough in common, or the correspondences are not used.
     """
     inliers, T = at.objective, at.T_camera_lidar
-    rig = inliers.rig.moved_to(T)
-    terms = pair_terms(rig, matches, inliers.config)
     if not terms or not inliers.uses_correspondences:
         return None
-    least = _least_sigmas(terms, T)
-    for step in range(_NARROWINGS):
-        now = np.array([term.sigma_px(T) for term in terms])
-        sigmas = least * np.maximum(now / least, 1.0) ** (1.0 - (step + 1) / _NARROWINGS)
-        scaled = tuple(t.with_sigma(s) for t, s in zip(terms, sigmas.tolist(), strict=True))
-        near = replace(inliers, pairs=scaled)
+    least = np.array([term.sigma_px(alone[term.pair]) for term in terms])
+    now = np.array([term.sigma_px(T) for term in terms])
+    steps = int(np.clip(np.ceil(np.log2((now / least).max())), 1, _NARROWINGS))
+    for step in range(steps):
+        now = now if step == 0 else np.array([term.sigma_px(T) for term in terms])
+        sigmas = least * np.maximum(now / least, 1.0) ** (1.0 - (step + 1) / steps)
+        scaled = [t.with_sigma(s) for t, s in zip(terms, sigmas.tolist(), strict=True)]
+        near = inliers.with_pairs(scaled)
         T = near.minimize(T, at.scales, tolerance=_COARSE).T_camera_lidar
-    kept = tuple(t.without_outliers(T, s) for t, s in zip(scaled, sigmas.tolist(), strict=True))
-    joined = replace(inliers, pairs=kept)
+    kept = [t.without_outliers(T, s) for t, s in zip(scaled, sigmas.tolist(), strict=True)]
+    joined = inliers.with_pairs(kept)
     return joined, joined.minimize(T, at.scales)
 
 
-def _least_sigmas(terms: Sequence[PairTerm], T_camera_lidar: Mapping[str, Array]) -> Array:
-    """(n,) spread of each term's residuals where its pair's terms alone place the cameras.
-
-    At an estimate that is wrong, residuals are large, and so would be the spread by which they are
-    weighed: the pair could not correct it.
-    """
+def place_pairs(terms: Sequence[PairTerm], T_camera_lidar: Mapping[str, Array]) -> Places:
+    """Per pair, (4, 4) T_camera_lidar of both cameras by its terms alone, the first held nearby."""
     covariance = np.diag(pose_sigmas(rotation_rad=_HELD_RAD, translation_m=_HELD_M) ** 2)
-    found: dict[frozenset[str], dict[str, Array]] = {}
-    for term in terms:
-        pair = frozenset((term.a, term.b))
-        if pair not in found:
-            own = [other for other in terms if {other.a, other.b} == pair]
-            names = term.a, term.b
-            found[pair], _ = fit_pair(names, own, T_camera_lidar, covariance, last_step=_NEAR)
-    return np.array([term.sigma_px(found[frozenset((term.a, term.b))]) for term in terms])
+    found = {}
+    for pair in dict.fromkeys(term.pair for term in terms):
+        a, b = (name for name in T_camera_lidar if name in pair)
+        own = [term for term in terms if term.pair == pair]
+        found[pair], _ = fit_pair((a, b), own, T_camera_lidar, covariance)
+    return found
 
 
 def pair_sigmas() -> Array:
@@ -98,42 +96,45 @@ def fit_pair(
     start: Mapping[str, Array],
     covariance_a: Array,
     *,
-    last_step: float = _CONVERGED,
+    near: Mapping[str, Array] | None = None,
 ) -> tuple[dict[str, Array], Array]:
     """Both cameras of a pair by what they see in common, the first held near its start.
 
-    By Gauss-Newton steps; before each the terms' sigmas are those of their residuals.
+    By Gauss-Newton steps; before each the terms' sigmas are those of their residuals, until these
+    stand.
 
     Args:
         names: A and B.
         terms: of this pair.
         start: (4, 4) T_camera_lidar of both.
         covariance_a: (6, 6) of the start of A, of xi in T_camera_lidar = exp(xi) start.
-        last_step: [rad, m] at which it stops.
+        near: where both are about; None: at the start.
 
     Returns:
         (4, 4) T_camera_lidar of both; their (12, 12) covariance, if features of a frame err as
         usual.
     """
-    T, held = np.stack([start[name] for name in names]), np.linalg.pinv(covariance_a)
-    prior, excess = np.zeros((12, 12)), usual_excess(terms)
-    prior[:6, :6] = held
-    for _ in range(_MAX_STEPS):
+    T, held = np.stack([(near or start)[name] for name in names]), np.linalg.pinv(covariance_a)
+    prior, rows = np.zeros((12, 12)), [rows_of_pair(names, term) for term in terms]
+    prior[:6, :6], sigmas, stands = held, np.zeros(len(terms)), False
+    for number in range(_MAX_STEPS):
         now, data, gradient = dict(zip(names, T, strict=True)), np.zeros((12, 12)), np.zeros(12)
-        for term in terms:
-            sums = term.with_sigma(term.sigma_px(now)).sums(now)
-            rows = rows_of_pair(names, term)
-            data[np.ix_(rows, rows)] += sums.hessian
-            gradient[rows] += sums.gradient
-        away = local_coordinates(start[names[0]], invert(T[:1]))[0]
-        gradient[:6] += held @ away
+        if not stands:
+            before, sigmas = sigmas, np.array([term.sigma_px(now) for term in terms])
+            stands = number > _MOST or bool((np.abs(sigmas - before) <= _SETTLED * sigmas).all())
+            scaled = [t.with_sigma(s) for t, s in zip(terms, sigmas.tolist(), strict=True)]
+        for own, term in zip(rows, scaled, strict=True):
+            sums = term.sums(now)
+            data[own[:, None], own] += sums.hessian
+            gradient[own] += sums.gradient
+        gradient[:6] += held @ local_coordinates(start[names[0]], invert(T[:1]))[0]
         hessian = prior + data
         step = -np.linalg.solve(hessian + DAMPING * np.diag(np.diag(hessian)), gradient)
         step *= min(1.0, _MAX_STEP / np.abs(step).max())
         T = retract_all(T, np.asarray(step.reshape(2, 6)))
-        if np.abs(step).max() < last_step:
+        if np.abs(step).max() < _CONVERGED:
             break
-    covariance = np.linalg.pinv(prior + data / excess, hermitian=True)
+    covariance = np.linalg.pinv(prior + data / usual_excess(terms), hermitian=True)
     return dict(zip(names, T, strict=True)), np.asarray(covariance)
 
 
@@ -165,25 +166,26 @@ class PairFit:
         return sum(len(term.frame) for term in self.terms)
 
 
-def fit_pairs(rig: Rig, matches: CameraMatches, config: Config, held: Array) -> list[PairFit]:
-    """Each pair of cameras with enough features on surfaces, in the table's order.
+def fit_pairs(
+    terms: Sequence[PairTerm], T_camera_lidar: Mapping[str, Array], held: Array, alone: Places
+) -> list[PairFit]:
+    """Each pair of cameras with enough features on surfaces, by these.
 
     Args:
-        rig: at the calibration that A is held near.
-        matches: with the surfaces there.
-        config: the loss.
-        held: (N, 6, 6) covariances by which cameras are held, in the rig's order.
+        terms: with the surfaces at the calibration.
+        T_camera_lidar: (4, 4) the calibration, that A is held near.
+        held: (N, 6, 6) covariances by which cameras are held.
+        alone: by :func:`place_pairs`.
     """
-    fits, cameras = [], list(rig.cameras)
-    for a, b in matches.pairs():
-        terms = tuple(
-            term for term in pair_terms(rig, matches.of_pair(a, b), config) if term.block.axes > 1
-        )
-        if terms:
+    fits, cameras = [], list(T_camera_lidar)
+    for pair, near in alone.items():
+        own = tuple(term for term in terms if term.pair == pair and term.block.axes > 1)
+        if own:
+            a, b = (name for name in cameras if name in pair)
             of_a = held[cameras.index(a)]
-            T, both = fit_pair((a, b), terms, rig.T_camera_lidar, of_a)
-            own = relative_covariance(both, 0, 1, relative_transform(T[b], T[a]))
-            fits.append(PairFit(a, b, terms, T, own + np.diag(pair_sigmas() ** 2)))
+            T, both = fit_pair((a, b), own, T_camera_lidar, of_a, near=near)
+            covariance = relative_covariance(both, 0, 1, relative_transform(T[b], T[a]))
+            fits.append(PairFit(a, b, own, T, covariance + np.diag(pair_sigmas() ** 2)))
     return fits
 
 

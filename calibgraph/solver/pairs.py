@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import gtsam
@@ -13,7 +12,6 @@ from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.model.camera_matches import CameraMatches
-from calibgraph.model.config import Config
 from calibgraph.model.findings import error_components
 from calibgraph.model.geometry import inverse_ranges, to_T_lidar_camera
 from calibgraph.model.rig import Rig
@@ -57,11 +55,10 @@ class PairTerm:
     block: PairBlock
     frame: NDArray[np.int64]
 
-    @cached_property
-    def frame_edges(self) -> NDArray[np.int64]:
-        """(f + 1,) where the frames begin, and the end."""
-        new = np.flatnonzero(np.diff(self.frame)) + 1
-        return np.concatenate([[0], new, [len(self.frame)]])
+    @property
+    def pair(self) -> frozenset[str]:
+        """Its cameras."""
+        return frozenset((self.a, self.b))
 
     def select(self, rows: NDArray[Any]) -> PairTerm:
         """Some rows: a mask, or an index array in rising order."""
@@ -90,12 +87,6 @@ class PairTerm:
         """H (12, 12), b (12,) and c, in the tangents of ``T_lidar_a`` and ``T_lidar_b``."""
         return self.block.sums(*self._poses(T_camera_lidar))
 
-    def frame_sums(self, T_camera_lidar: Mapping[str, Array]) -> tuple[Array, Array]:
-        """(f, 12, 12) H and (f, 12) b of each frame."""
-        a, b = (pose.matrix()[None] for pose in self._poses(T_camera_lidar))
-        sums = self.block.run_sums(a, b, self.frame_edges)
-        return sums.hessian, sums.gradient
-
     def _poses(self, T_camera_lidar: Mapping[str, Array]) -> tuple[gtsam.Pose3, gtsam.Pose3]:
         return (
             to_T_lidar_camera(T_camera_lidar[self.a]),
@@ -119,7 +110,7 @@ def usual_excess(terms: Sequence[PairTerm]) -> float:
     return 1 + error_components().pair_correlation * max(0.0, len(numbers) / frames - 1)
 
 
-def pair_terms(rig: Rig, table: CameraMatches, config: Config) -> tuple[PairTerm, ...]:
+def pair_terms(rig: Rig, table: CameraMatches) -> tuple[PairTerm, ...]:
     """The terms of all pairs of a table: A's features in B, B's in A, and epipolar.
 
     The epipolar residual is that of features without a surface in either camera, of pairs that have
@@ -128,19 +119,17 @@ def pair_terms(rig: Rig, table: CameraMatches, config: Config) -> tuple[PairTerm
     Args:
         rig: lenses, and extrinsics at which surfaces are ahead of a camera.
         table: with surfaces.
-        config: the loss.
     """
     terms = []
     for a, b in table.pairs():
         rows = table.of_pair(a, b)
         rows = rows.select(np.argsort(rows.frame, kind="stable"))
         sides = [
-            _term_of_side(rig, names, side, rows, config=config)
-            for side, names in enumerate(((a, b), (b, a)))
+            _term_of_side(rig, names, side, rows) for side, names in enumerate(((a, b), (b, a)))
         ]
         terms += sides
         if sum(len(term.frame) for term in sides) < ENOUGH_SURFACES:
-            terms.append(_epipolar_term(rig, (a, b), rows, config))
+            terms.append(_epipolar_term(rig, (a, b), rows))
     return tuple(term for term in terms if len(term.frame) >= MIN_PAIR_MATCHES)
 
 
@@ -186,9 +175,7 @@ def match_errors_px(rig: Rig, table: CameraMatches) -> Array:
     return errors
 
 
-def _term_of_side(
-    rig: Rig, names: tuple[str, str], side: int, rows: CameraMatches, *, config: Config
-) -> PairTerm:
+def _term_of_side(rig: Rig, names: tuple[str, str], side: int, rows: CameraMatches) -> PairTerm:
     """The features of one side with their surfaces, predicted in the other camera."""
     a, b = (rig.cameras[name] for name in names)
     rows = rows.select(np.isfinite(rows.planes_lidar_per_m[:, side, 0]))
@@ -198,15 +185,11 @@ def _term_of_side(
     rows = rows.select(ahead)
     pixels = rows.pixels_px[:, 1 - side]
     block = PairBlock.of_surfaces(b.lens, rays[ahead], planes[ahead], pixels)
-    block = replace(block, loss=config.loss)
     return PairTerm(*names, block, rows.frame)
 
 
-def _epipolar_term(
-    rig: Rig, names: tuple[str, str], rows: CameraMatches, config: Config
-) -> PairTerm:
+def _epipolar_term(rig: Rig, names: tuple[str, str], rows: CameraMatches) -> PairTerm:
     rows = rows.select(np.flatnonzero(np.isnan(rows.planes_lidar_per_m[:, :, 0]).all(axis=1)))
     a, b = (rig.cameras[name] for name in names)
     block = PairBlock.epipolar(a.lens, b.lens, rows.pixels_px[:, 0], rows.pixels_px[:, 1])
-    block = replace(block, loss=config.loss)
     return PairTerm(*names, block, rows.frame)

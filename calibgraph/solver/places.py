@@ -26,7 +26,6 @@ from typing import NamedTuple
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.graph.components import VarianceRatios
@@ -51,12 +50,12 @@ from calibgraph.model.geometry import (
 from calibgraph.model.pose_kernel import logarithms
 from calibgraph.solver.two_pass import MAX_ITERATIONS
 from factors import BlockSums
-from factors.conditioning import SINGULAR, unit_diagonal
+from factors.conditioning import unit_diagonal
 
 TOLERANCE = 1e-6
 """Relative change of the cost at which it stops: some 1e-3 of the smallest standard deviations."""
 
-_ROUNDING = 3e-15  # smallest part of a sum that a difference may leave
+_FREE = 1e3  # rad and m: a standard deviation that no correspondences have
 _SHARES = 0.5 ** np.arange(12)
 """Of a step: the first that descends; mostly the whole step."""
 
@@ -217,18 +216,10 @@ class Linearization:
         return Ties.of(shared, self.inverses, covariance, parts.robust_scale)
 
     @property
-    def weights(self) -> Array:
-        """(P, 1 + N) of the cloud and of each camera at each place, in the robust loss."""
-        return self._by_camera(self.ties.weight, 1.0)
-
-    @property
     def distances(self) -> Array:
         """(P, 1 + N) in sigmas: of o_p from o, of a_cp from m_c; 0 where there are no data."""
-        return self._by_camera(self.ties.distance, 0.0)
-
-    def _by_camera(self, rows: Array, otherwise: float) -> Array:
-        found = np.full((self.model.places, 1 + len(self.model.cameras)), otherwise)
-        found[:, [0, *(1 + number for number in self.model.matched)]] = rows.T
+        found = np.zeros((self.model.places, 1 + len(self.model.cameras)))
+        found[:, [0, *(1 + number for number in self.model.matched)]] = self.ties.distance.T
         return found
 
     @cached_property
@@ -349,31 +340,14 @@ class Linearization:
         return None
 
     def is_determined(self) -> bool:
-        """Whether every direction of every camera is, but for rounding noise."""
+        """Whether every direction of every camera is: of a free one rounding leaves far more."""
         if not {*self.model.camera_keys} <= {*self.model.shared_graph.keyVector()}:
             return False  # nothing acts on a camera
-        whole, at = self.hessian(), self.model.columns_of(self.model.reported_keys)
-        if not (np.isfinite(whole).all() and (np.diag(whole) > 0).all()):
-            return False
         try:
-            left, own = _left_information(whole, at), self.joint_covariance[at, at]
+            variances = np.diag(self.covariance_of(self.model.reported_keys))
         except np.linalg.LinAlgError:
             return False
-        if np.diag(left).min() <= 0 or own.min() <= 0:
-            return False
-        values = np.linalg.eigvalsh(unit_diagonal(left)[0])
-        before = np.sqrt(np.diag(self.shared_hessian[0])[at])
-        share = np.linalg.eigvalsh(left / np.outer(before, before))[0]
-        return bool(values[0] > SINGULAR * values[-1] and share > _ROUNDING)
-
-
-def _left_information(hessian: Array, rows: NDArray[np.intp]) -> Array:
-    """(r, r) of some unknowns, the others eliminated."""
-    scaled, units = unit_diagonal(hessian)
-    others = np.delete(np.arange(len(hessian)), rows)
-    across = np.linalg.solve(scaled[np.ix_(others, others)], scaled[np.ix_(others, rows)])
-    left = scaled[np.ix_(rows, rows)] - scaled[np.ix_(rows, others)] @ across
-    return np.asarray(left * np.outer(units[rows], units[rows]))
+        return bool(((variances > 0) & (variances < _FREE**2)).all())
 
 
 def _soften(
@@ -403,7 +377,6 @@ class ErrorFit:
 
     Attributes:
         linear: the graph linearized there.
-        iterations: number of Gauss-Newton steps.
         change: of the cost by the last step, relative to it.
         keys: of the poses that are reported.
         ratios: of its variance components.
@@ -412,7 +385,6 @@ class ErrorFit:
     """
 
     linear: Linearization
-    iterations: int
     change: float
     keys: Sequence[int]
     ratios: VarianceRatios = VarianceRatios()
@@ -496,17 +468,19 @@ def fit_latent_poses(
     present = start if start.model is model else start.with_model(model)
     if not (is_determined or present.is_determined()):
         return None
-    iterations, change = 0, np.inf
-    while iterations < MAX_ITERATIONS and change > relative_tolerance:
+    change = np.inf
+    for _ in range(MAX_ITERATIONS):
         try:
             found = present.descend()
         except np.linalg.LinAlgError:
             return None
         if found is None:  # this is the minimum, to rounding
-            return ErrorFit(present, iterations, 0.0, model.reported_keys)
+            return ErrorFit(present, 0.0, model.reported_keys)
         change = (present.cost - found.cost) / max(present.cost, np.finfo(float).tiny)
-        present, iterations = found, iterations + 1
-    return ErrorFit(present, iterations, change, model.reported_keys)
+        present = found
+        if change <= relative_tolerance:
+            break
+    return ErrorFit(present, change, model.reported_keys)
 
 
 def start_values(model: LatentPoseModel, T_camera_lidar: Mapping[str, Array]) -> Linearization:

@@ -18,7 +18,7 @@ from calibgraph.model.rig import Camera
 from calibgraph.solver.matches import MIN_MATCHES
 from factors import ProjectionBlock, unproject
 from factors.arrays import unpack_sums
-from factors.conditioning import are_regular
+from factors.conditioning import smallest_scaled_eigenvalues
 
 Runs = NDArray[np.int64]
 """(f, 2): the first correspondence of each frame, and the one behind its last."""
@@ -121,7 +121,7 @@ def refine_frames(
         places[~found] = 0
         fit = fit_frames(some, places, T_camera_lidar, tolerance=tolerance)
         T_camera_lidar = fit.T_camera_lidar
-        found &= are_regular(fit.hessians, _MIN_SCALED_EIGENVALUE)
+        found &= smallest_scaled_eigenvalues(fit.hessians) >= _MIN_SCALED_EIGENVALUE
     return FramePoses(T_camera_lidar, fit.hessians, found, inliers)
 
 

@@ -1,8 +1,6 @@
 """The paper's preprocessing, with a count at every filter; repeated frames count as one."""
 
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,17 +8,14 @@ from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.errors import CorrespondenceError
-from calibgraph.io.tables import parts_of_table
 from calibgraph.model.config import Config
-from calibgraph.model.correspondences import Correspondences, concatenate, rows_where
+from calibgraph.model.correspondences import Correspondences, rows_where
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.rig import Rig
 from factors.compiled import compiled
 
 FILTERS = ("given", "projectable", "confident", "best_in_cell", "capped")
 """The stages at which a camera's correspondences are counted, in order."""
-
-_MERGED_ROWS = 250_000  # rows of parts before they are merged, about 15 to 25 MB
 
 
 @dataclass(frozen=True)
@@ -61,36 +56,16 @@ def with_common_error(table: Correspondences, config: Config) -> Correspondences
     return table
 
 
-def preprocess(rig: Rig, table: Correspondences | Path | str, config: Config) -> Preprocessed:
+def preprocess(rig: Rig, table: Correspondences, config: Config) -> Preprocessed:
     """Depth filter, confidence filter, best match per grid cell, cap per camera and frame.
-
-    The table may be a file larger than memory, which is read in parts: memory is needed
-    for one row group of it and for what the grid keeps, at most one match of each cell, camera and
-    frame, in whatever order the rows are. A CSV file is read whole.
 
     Raises:
         CorrespondenceError: if the table names a camera that the rig does not have, or states
             another common error than the settings.
-        FileError: as of :func:`calibgraph.load_correspondences`.
     """
-    parts = [table] if isinstance(table, Correspondences) else parts_of_table(Path(table))
-    return preprocess_parts(rig, parts, config)
-
-
-def preprocess_parts(rig: Rig, parts: Iterable[Correspondences], config: Config) -> Preprocessed:
-    """As :func:`preprocess`, of a table in parts, at least one."""
-    kept: list[Correspondences] = []
+    usable = with_common_error(table.without_cameras(config.excluded_cameras), config)
     counts = np.zeros((len(FILTERS), len(rig.cameras)), dtype=np.int64)
-    merged_rows = 0
-    for part in parts:
-        usable = with_common_error(part.without_cameras(config.excluded_cameras), config)
-        best, passed = _filter(rig, usable, config)
-        counts[:3] += passed
-        kept.append(best)
-        if sum(map(len, kept)) > 2 * merged_rows + _MERGED_ROWS:
-            kept = [_merge(rig, kept, config)]
-            merged_rows = len(kept[0])
-    table = _merge(rig, kept, config)
+    table, counts[:3] = _filter(rig, usable, config)
     camera = camera_numbers(rig, table)
     counts[3] = np.bincount(camera, minlength=len(rig.cameras))
     table, camera, repeated = _count_repeats_once(rig, table, camera, config)
@@ -142,7 +117,7 @@ def _frames_by_camera(
 def _filter(
     rig: Rig, table: Correspondences, config: Config
 ) -> tuple[Correspondences, NDArray[np.int64]]:
-    """The best rows of a part, by camera and frame.
+    """The best rows, by camera and frame.
 
     And (3, N) per camera, how many are given, projectable, confident.
     """
@@ -153,14 +128,6 @@ def _filter(
     reached = np.bincount(3 * camera + furthest, minlength=3 * len(rig.cameras)).reshape(-1, 3)
     passed = np.cumsum(reached[:, ::-1], axis=1)[:, ::-1].T
     return table.select(best_in_cell(rig, table, camera, config, among=confident)), passed
-
-
-def _merge(rig: Rig, kept: Sequence[Correspondences], config: Config) -> Correspondences:
-    """The best matches of the parts' best matches, sorted by camera and frame."""
-    if len(kept) == 1:
-        return kept[0]
-    table = concatenate(kept)
-    return table.select(best_in_cell(rig, table, camera_numbers(rig, table), config))
 
 
 def camera_numbers(rig: Rig, table: Correspondences) -> NDArray[np.int64]:
@@ -210,9 +177,6 @@ def within_cap(
     return np.flatnonzero(rank < config.matches_max)
 
 
-_MOST_CELLS = 1 << 20  # 8 MB of places; of more cells, those that are taken are numbered
-
-
 def best_in_cell(
     rig: Rig,
     table: Correspondences,
@@ -241,9 +205,6 @@ def best_in_cell(
     among = np.ones(len(table), dtype=np.bool_) if among is None else among
     cell, cells = np.empty(len(table), np.int64), config.grid_columns * config.grid_rows
     _number_cells(camera, table.pixels_px, sizes, shape, cell)
-    if cells > _MOST_CELLS:
-        taken, cell = np.unique(cell, return_inverse=True)
-        cells = len(taken)
     if _are_sorted(camera, table.frame):
         edges = frame_edges(camera, table.frame)
         return np.flatnonzero(_best_of_runs(edges, cells, cell, table.confidence, among))
@@ -380,12 +341,6 @@ def _first_of_same_content(hashes: Hashes, counts: Numbers) -> Numbers:
     for one, other in pairs[alike]:
         found[other] = min(found[other], found[one])
     return found
-
-
-def hash_numbers(points_lidar_m: Array) -> list[int]:
-    """:func:`point_hashes` as numbers: a set of some hundred is faster than arrays."""
-    numbers: list[int] = point_hashes(points_lidar_m).tolist()
-    return numbers
 
 
 def point_hashes(points: Array) -> Hashes:

@@ -7,7 +7,7 @@ is the minimum of Eq. 5, and the model serves for its covariance alone.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import gtsam
@@ -22,7 +22,7 @@ from calibgraph.model.error_sources import ErrorSources
 from calibgraph.model.geometry import pose_rows
 from calibgraph.model.lens import LensEstimate
 from calibgraph.model.rig import Rig
-from calibgraph.solver.covariance import FittedObjective, data_sigmas
+from calibgraph.solver.covariance import FittedObjective
 from calibgraph.solver.error_model import (
     Conflict,
     fit_errors,
@@ -30,14 +30,17 @@ from calibgraph.solver.error_model import (
     relative_pose_conflict,
 )
 from calibgraph.solver.lens import lens_covariances, lens_estimates, moved_lenses, put_into
-from calibgraph.solver.pair_refinement import PairFit, fit_pairs, shared_variance_ratio
+from calibgraph.solver.pair_refinement import (
+    PairFit,
+    Places,
+    fit_pairs,
+    place_pairs,
+    shared_variance_ratio,
+)
+from calibgraph.solver.pairs import PairTerm, pair_terms
 from calibgraph.solver.places import ErrorFit
 from calibgraph.solver.sources import predict_variances, sources_by_camera, variances_by_source
 from calibgraph.solver.two_pass import Objective, Optimum, Scales, Transforms
-from factors import pose_sigmas
-
-_HELD_SIGMAS = pose_sigmas(rotation_rad=np.radians(0.1), translation_m=0.02)
-"""Of a camera that a pair is fitted to, if its covariance is unknown."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,11 +150,6 @@ class Solution:
             return latent_pose_graph(self.error_fit.model)
         return self.inliers.graph(self.scales)
 
-    @cached_property
-    def data_sigmas(self) -> Array | None:
-        """(N, 6) standard deviations if every correspondence were independent."""
-        return data_sigmas(self.fitted) if self.objective.uses_correspondences else None
-
     def error_sources(self, joint: Array) -> dict[str, ErrorSources]:
         """Per camera with an error bar, the shares of its sources.
 
@@ -166,17 +164,29 @@ class Solution:
         return sources_by_camera(joint, total, parts, forecast, numbers=numbers)
 
     @cached_property
+    def pair_terms(self) -> tuple[PairTerm, ...]:
+        """What cameras see in common, with surfaces as here; frames of one stop are one."""
+        if self.camera_matches is None:
+            return ()
+        frame = self.correspondences.places.merge_stationary(self.camera_matches.frame)
+        rig, matches = self.rig.moved_to(self.T_camera_lidar), self.camera_matches
+        return pair_terms(rig, replace(matches, frame=frame))
+
+    @cached_property
+    def pairs_alone(self) -> Places:
+        """Where pairs place their cameras, held near the estimate."""
+        return place_pairs(self.pair_terms, self.T_camera_lidar)
+
+    @cached_property
     def pair_fits(self) -> list[PairFit]:
         """The relative poses of pairs by images, the first camera held near its correspondences."""
         if self.alone is not None:
             return self.alone.pair_fits
-        if self.camera_matches is None:
+        if (joint := self.covariance) is None:
             return []
-        count, prior = len(self.fitted.cameras), _HELD_SIGMAS**2
-        joint = np.diag(np.tile(prior, count)) if self.covariance is None else self.covariance
-        held = [joint[pose_rows(number), pose_rows(number)] for number in range(count)]
-        rig = self.rig.moved_to(self.T_camera_lidar)
-        return fit_pairs(rig, self.camera_matches, self.config, np.array(held))
+        rows = map(pose_rows, range(len(self.fitted.cameras)))
+        held = np.array([joint[own, own] for own in rows])
+        return fit_pairs(self.pair_terms, self.T_camera_lidar, held, self.pairs_alone)
 
     @cached_property
     def conflicts(self) -> tuple[Conflict, ...]:

@@ -12,7 +12,6 @@ import gtsam
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.graph.components import shown_distortion
 from calibgraph.graph.variables import DISTORTION
 from calibgraph.model.error_sources import (
     COMMON,
@@ -107,7 +106,8 @@ def predict_variances(errors: ErrorFit) -> dict[int, Array]:
         whole = linear.hessian(times)
         if linear.model.is_distorted:
             own = linear.model.columns[DISTORTION]
-            whole[np.ix_(own, own)] += (times - 1) * shown_distortion(linear.model.components)[0]
+            more = (times - 1) * linear.model.components.distortion_information
+            whole[np.ix_(own, own)] += more
         found[times] = np.diag(invert_scaled(whole))[at]
     return found
 

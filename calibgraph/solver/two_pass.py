@@ -46,13 +46,11 @@ class Optimum:
     Attributes:
         T_camera_lidar: per camera, (4, 4).
         cost: the paper's objective there (twice GTSAM's error).
-        iterations: of LM.
         converged: whether it stopped by its tolerance.
     """
 
     T_camera_lidar: dict[str, Array]
     cost: float
-    iterations: int
     converged: bool
 
 
@@ -83,8 +81,7 @@ def optimize(
     optimizer = gtsam.LevenbergMarquardtOptimizer(graph, start, _parameters(tolerance))
     values = optimizer.optimize()
     found = {name: to_T_camera_lidar(values.atPose3(pose_key(cameras, name))) for name in cameras}
-    iterations = int(optimizer.iterations())
-    return Optimum(found, 2.0 * optimizer.error(), iterations, iterations < MAX_ITERATIONS)
+    return Optimum(found, 2.0 * optimizer.error(), optimizer.iterations() < MAX_ITERATIONS)
 
 
 @cache
@@ -173,23 +170,17 @@ class Objective:
             for name, (block, T, scale) in self.gated.items()
         }
 
-    def with_blocks(self, blocks: Mapping[str, CameraBlock]) -> Objective:
-        """The same objective with other (fewer) correspondences, and the pairs of their frames."""
-        if not self.pairs:
-            return self._with(blocks=dict(blocks))
-        frames = np.concatenate([b.frame_numbers for b in blocks.values()])
-        pairs = tuple(pair.select(np.isin(pair.frame, frames)) for pair in self.pairs)
-        return self._with(blocks=dict(blocks), pairs=pairs)
+    def with_pairs(self, pairs: Sequence[PairTerm]) -> Objective:
+        """The same objective with what cameras see in common."""
+        other = self._with(pairs=tuple(pairs))
+        other.__dict__["gate_hessian"] = self.gate_hessian
+        return other
 
     def _with(self, **fields: Any) -> Objective:
         """With other fields, on which the terms between poses do not depend."""
         other = replace(self, **fields)
         other.__dict__["pose_graph"] = self.pose_graph
         return other
-
-    def without_pairs(self) -> Objective:
-        """The same objective without what cameras see in common."""
-        return self._with(pairs=())
 
     def data_only(self) -> Objective:
         """The reprojection term alone, of the cameras that have correspondences."""
@@ -204,7 +195,7 @@ class Objective:
     ) -> Optimum:
         """The minimum by Levenberg-Marquardt, with the residuals' scales held constant."""
         if self.terms == "stage1":
-            return Optimum(start, math.nan, 0, True)
+            return Optimum(start, math.nan, True)
         return optimize(self._joined(scales), self.cameras, start, tolerance=tolerance)
 
     def _joined(self, scales: Scales) -> gtsam.NonlinearFactorGraph:
@@ -314,7 +305,7 @@ class Objective:
                     camera=name,
                 )
         gated = {n: (block, T_camera_lidar[n], scales[n]) for n, block in self.blocks.items()}
-        return self.with_blocks(inliers)._with(gated=gated)
+        return self._with(blocks=inliers, gated=gated)
 
 
 def best_start(

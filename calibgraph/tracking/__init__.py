@@ -3,7 +3,7 @@
 from calibgraph.tracking.assessment import Update
 from calibgraph.tracking.durable import DurableCalibrator
 from calibgraph.tracking.events import Event
-from calibgraph.tracking.frame_order import StreamFrame
+from calibgraph.tracking.frames import StreamFrame
 from calibgraph.tracking.tracker import IncrementalCalibrator, warm_up_tracker
 
 __all__ = [

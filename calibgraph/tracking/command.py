@@ -21,18 +21,17 @@ from calibgraph.matching.same_images import require_different_images
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.config import Config
 from calibgraph.model.rig import Rig
-from calibgraph.model.verdict import START, Verdict
+from calibgraph.model.verdict import START
 from calibgraph.report.as_json import print_line, require_stdout
 from calibgraph.tracking.assessment import Update, json_lines
-from calibgraph.tracking.dataset_frames import DatasetDrive, Stop
+from calibgraph.tracking.dataset_frames import DatasetDrive
 from calibgraph.tracking.durable import DurableCalibrator
-from calibgraph.tracking.history import History
-from calibgraph.tracking.streams import Item, frames_of
+from calibgraph.tracking.frames import Item, frames_of
 from calibgraph.tracking.tracker import UNSOLVABLE, IncrementalCalibrator, warm_up_tracker
 
 Notify = Callable[[str], None]
 
-STATE_FOLDER, PICTURE = "state", "track.png"
+STATE_FOLDER = "state"
 _TOGETHER = 50  # frames of a table that are taken in by one write
 
 
@@ -43,7 +42,7 @@ class Tracking:
     Attributes:
         rig: the initial guess.
         config: settings.
-        out: folder for the state, the result and the picture.
+        out: folder for the state and the result.
         every: of datasets, match every so-many-th frame.
         matcher: for the frames of datasets; None for tables.
         interval_s: between neighbouring clouds of folders, whose registration shows the motion.
@@ -57,6 +56,41 @@ class Tracking:
     matcher: Matcher | None = None
     interval_s: float | None = None
     bag: BagOptions | None = None
+
+
+def track(
+    settings: Tracking, source: Sequence[Path], *, notify: Notify
+) -> tuple[Calibration, list[Path]]:
+    """Track a source until it ends or a signal comes; a line of JSON per update on stdout.
+
+    Args:
+        settings: see there.
+        source: a table, or -; with a matcher, dataset folders.
+        notify: called with warnings and events as sentences.
+
+    Returns:
+        The last estimate; the files written.
+
+    Raises:
+        CalibrationError: if the source, the rig or the state cannot be used, or there is no frame.
+    """
+    require_stdout()
+    settings.rig.require_cameras()
+    waits = str(source[0]) == "-"  # frames come at their own times
+    with _stopped_by_signals() as stop:
+        if waits:
+            warm_up_tracker()
+        items, calibrator = _opened(settings, source, notify)
+        gc.freeze()  # what is loaded by now stays: each full collection would visit it, for 0.1 s
+        run = Run(calibrator, notify)
+        with calibrator:
+            run.follow(items, 1 if waits or settings.matcher is not None else _TOGETHER, stop)
+            if calibrator.tracker.frame is None and not stop.received:
+                held = f"held no frame that could be used ({run.left_out} left out); check it"
+                raise FileError("standard input" if waits else source[0], held)
+            result = _result(calibrator.tracker, settings)
+    run.report_counts()
+    return result, [result.save(settings.out)]
 
 
 @dataclass
@@ -77,11 +111,8 @@ class Run:
     left_out: int = 0
     skipped: int = 0
 
-    def __post_init__(self) -> None:
-        self.history = History()
-
     def follow(self, items: Iterator[Item], together: int, stop: Stop) -> None:
-        """Update with each frame until there are no more, or ``stop()``.
+        """Update with each frame until there are no more, or a signal has come.
 
         Each update is printed once it is on disk; after a crash, those of the last write come
         first, since they may not have been printed. A reader that goes away ends the run.
@@ -94,7 +125,7 @@ class Run:
         known = self.calibrator.tracker.frame if self.calibrator.resumed else None
         try:
             self._report(self.calibrator.repeated)
-            while some := _next(items, together, stop):
+            while some := stop.next_of(items, together):
                 new = [one for one in some if not self._is_known(one, known)]
                 frames = [one for one in new if not isinstance(one, CalibrationError)]
                 errors = [one for one in new if isinstance(one, CalibrationError)]
@@ -128,93 +159,38 @@ class Run:
 
     def _report(self, updates: Sequence[Update]) -> None:
         for update, line in zip(updates, json_lines(updates), strict=True):
-            self.history.add(update)
             print_line(line)
             for event in update.events:
                 self.notify(f"frame {event.detected_frame}: {event}")
 
 
-def _next(items: Iterator[Item], most: int, stop: Stop) -> list[Item]:
-    """The next items; none at the end, or if a signal has come or comes while they are awaited."""
-    try:
-        with stop.interruptible():
-            return [*islice(items, most)]
-    except KeyboardInterrupt:
-        return []
+def _result(tracker: IncrementalCalibrator, settings: Tracking) -> Calibration:
+    """That of the guess, not of where the first batch has located it.
 
-
-def track(
-    settings: Tracking, source: Sequence[Path], *, notify: Notify
-) -> tuple[Calibration, list[Path]]:
-    """Track a source until it ends or a signal comes; a line of JSON per update on stdout.
-
-    Args:
-        settings: see there.
-        source: a table, or -; with a matcher, dataset folders.
-        notify: called with warnings and events as sentences.
-
-    Returns:
-        The last estimate; the files written.
-
-    Raises:
-        CalibrationError: if the source, the rig or the state cannot be used, or there is no frame.
+    A camera without an estimate fails at the end, as one that `calibrate` does not find.
     """
-    require_stdout()
-    settings.rig.require_cameras()
-    waits = str(source[0]) == "-"  # frames come at their own times
-    with _stopped_by_signals() as stop:
-        if waits:
-            warm_up_tracker()
-        items, calibrator, result_of = _opened(settings, source, stop, notify)
-        gc.freeze()  # what is loaded by now stays: each full collection would visit it, for 0.1 s
-        run = Run(calibrator, notify)
-        with calibrator:
-            run.follow(items, 1 if waits or settings.matcher is not None else _TOGETHER, stop)
-            if calibrator.tracker.frame is None and not stop():
-                held = f"held no frame that could be used ({run.left_out} left out); check it"
-                raise FileError("standard input" if waits else source[0], held)
-            result = _result(calibrator.tracker, result_of, settings.out / STATE_FOLDER)
-    run.report_counts()
-    # The guess, not where the first batch has located it.
-    verdicts = {name: _at_the_end(one) for name, one in result.camera_verdicts.items()}
-    result = replace(result, initial_rig=settings.rig, camera_verdicts=verdicts)
-    written = [result.save(settings.out)]
-    if run.updates:
-        run.history.draw(settings.out / PICTURE)
-        written.append(settings.out / PICTURE)
-    return result, written
-
-
-def _at_the_end(verdict: Verdict) -> Verdict:
-    """A camera without an estimate fails at the end, as one that `calibrate` does not find."""
-    return replace(
-        verdict,
-        checks=tuple(
-            replace(check, status="FAIL") if check.name == START else check
-            for check in verdict.checks
-        ),
-    )
-
-
-def _result(
-    tracker: IncrementalCalibrator, of: Callable[[IncrementalCalibrator], Calibration], state: Path
-) -> Calibration:
     try:
-        return of(tracker)
+        result = tracker.calibration()
     except UNSOLVABLE as error:
         why = str(error).strip().partition("\n")[0]
         raise CalibrationError(
             f"after frame {tracker.frame} the error bar cannot be solved for ({why}); all updates "
-            f"are in {state}, and the same command goes on from there with more frames"
+            f"are in {settings.out / STATE_FOLDER}, and the same command goes on from there with "
+            "more frames"
         ) from error
+    verdicts = {
+        name: replace(one, checks=tuple(
+            replace(check, status="FAIL") if check.name == START else check for check in one.checks
+        ))
+        for name, one in result.camera_verdicts.items()
+    }  # fmt: skip
+    return replace(result, initial_rig=settings.rig, camera_verdicts=verdicts)
 
 
 def _opened(
-    settings: Tracking, source: Sequence[Path], stop: Stop, notify: Notify
-) -> tuple[Iterator[Item], DurableCalibrator, Callable[[IncrementalCalibrator], Calibration]]:
-    """The frames of the source, the durable tracker, and the function that gives its result."""
-    result_of: Callable[[IncrementalCalibrator], Calibration]
-    result_of = partial(IncrementalCalibrator.calibration, sources=True)
+    settings: Tracking, source: Sequence[Path], notify: Notify
+) -> tuple[Iterator[Item], DurableCalibrator]:
+    """The frames of the source, and the durable tracker."""
     folder = settings.out / STATE_FOLDER
     if settings.matcher is None:
         items = frames_of(str(source[0]))
@@ -224,10 +200,9 @@ def _opened(
         begin = partial(_first_rig, drive, settings.rig, notify)
         calibrator = DurableCalibrator(folder, settings.rig, drive.config, begin=begin)
         items = drive.items(calibrator.tracker)
-        result_of = partial(drive.result, stop=stop, notify=notify)
     if calibrator.resumed:
         notify(f"going on after frame {calibrator.tracker.frame}")
-    return items, calibrator, result_of
+    return items, calibrator
 
 
 def _drive(settings: Tracking, matcher: Matcher, source: Sequence[Path]) -> DatasetDrive:
@@ -248,6 +223,29 @@ def _first_rig(drive: DatasetDrive, guess: Rig, notify: Notify) -> Rig:
         reasons = "; ".join(verdict.reasons)
         notify(f"warning: the first frames give no reliable start: {reasons}")
     return guess.moved_to(drive.start.rig.T_camera_lidar)
+
+
+@dataclass
+class Stop:
+    """Whether a signal to stop has come.
+
+    Attributes:
+        received: set by the first signal.
+        interrupts: whether that signal is raised, too, as KeyboardInterrupt.
+    """
+
+    received: bool = False
+    interrupts: bool = False
+
+    def next_of(self, items: Iterator[Item], most: int) -> list[Item]:
+        """The next items; none at the end, or if a signal has come or comes while they are due."""
+        self.interrupts = True
+        try:
+            return [] if self.received else [*islice(items, most)]
+        except KeyboardInterrupt:
+            return []
+        finally:
+            self.interrupts = False
 
 
 @contextmanager

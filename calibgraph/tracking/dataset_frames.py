@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 
-import cv2
-import numpy as np
-
-from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError, CorrespondenceError, MotionError
 from calibgraph.io.dataset import Dataset
 from calibgraph.io.frame import Frame
@@ -24,45 +19,12 @@ from calibgraph.model.rig import Rig
 from calibgraph.pipeline import calibrate
 from calibgraph.progress import no_progress
 from calibgraph.solver.joint import solve_joint
-from calibgraph.tracking.frame_order import StreamFrame
-from calibgraph.tracking.streams import Item, frames_of_table
+from calibgraph.tracking.frames import Item, StreamFrame, frames_of_table
 from calibgraph.tracking.sums import MOST_PLACES
 from calibgraph.tracking.tracker import IncrementalCalibrator
-from calibgraph.trust.pose_posterior import PosePosterior, measure_posteriors
-
-_UNSCORED = (CalibrationError, OSError, np.linalg.LinAlgError, cv2.error, RuntimeError)
-"""What reading and scoring images raises: a result after a long drive is not lost by it."""
 
 MOST_AGAIN = 200
 """Frames that a restart looks at again, at 0.1 s each, to find where the vehicle is."""
-
-
-@dataclass
-class Stop:
-    """Whether a signal to stop has come; called for the answer.
-
-    Attributes:
-        received: set by the first signal.
-        interrupts: whether that signal is raised, too, as KeyboardInterrupt.
-    """
-
-    received: bool = False
-    interrupts: bool = False
-
-    def __call__(self) -> bool:
-        """Whether it has come."""
-        return self.received
-
-    @contextmanager
-    def interruptible(self) -> Iterator[None]:
-        """Within, the signal raises KeyboardInterrupt; so does one that has come before."""
-        self.interrupts = True
-        try:
-            if self.received:
-                raise KeyboardInterrupt
-            yield
-        finally:
-            self.interrupts = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,39 +60,6 @@ class DatasetDrive:
         seed = self.config.seed
         finder = PlaceFinder(tracker.initial_rig, most_places=MOST_PLACES, seed=seed)
         return with_places(self._frames(tracker), self.dataset, finder, tracker.places)
-
-    def result(
-        self, tracker: IncrementalCalibrator, *, stop: Stop, notify: Callable[[str], None]
-    ) -> Calibration:
-        """The estimate, with its error bar and verdict by the images of its last frames, too.
-
-        Args:
-            tracker: at the end of the drive.
-            stop: whether the result is wanted at once, without the images; it interrupts them.
-            notify: called with a sentence if they are left out, or cannot be scored.
-        """
-        if self.matcher.image_checks_can_fail:  # others may use what the scores do not
-            try:
-                with stop.interruptible():
-                    return tracker.calibration(partial(self._measure, tracker.rig), sources=True)
-            except KeyboardInterrupt:
-                notify("stopped: the images were not compared with the clouds")
-            except _UNSCORED as error:
-                notify(f"warning: the images could not be checked: {error}")
-        return tracker.calibration(sources=True)
-
-    def _measure(
-        self,
-        rig: Rig,
-        numbers: Sequence[int],
-        covariances: Mapping[str, Array],
-        groups: Sequence[Sequence[str]],
-    ) -> Mapping[str, PosePosterior]:
-        frames = tuple(frame for frame in self.dataset.frames if frame.index in {*numbers})
-        if not frames:
-            return {}
-        data = replace(self.dataset, frames=frames)
-        return measure_posteriors(data, rig, covariances, groups, seed=self.config.seed)
 
     def _frames(self, tracker: IncrementalCalibrator) -> Iterator[Item]:
         head, taken = self._head, tracker.frame

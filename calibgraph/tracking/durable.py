@@ -1,7 +1,15 @@
-"""A tracker whose every update is on disk when it returns."""
+"""A tracker whose every update is on disk when it returns.
+
+An SQLite database has the state in its first row, then the inputs since. With a write-ahead log and
+``synchronous=FULL``, rows are on disk when their transaction returns, and a crash leaves all of it
+or none. Rows are numbered, so that a missing one is noticed; what they hold has a checksum of its
+own (``calibgraph.tracking.state_bytes``).
+"""
 
 from __future__ import annotations
 
+import errno
+import sqlite3
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
@@ -9,16 +17,29 @@ from types import TracebackType
 from typing import Any, Self
 
 from calibgraph.errors import CorrespondenceError, FileError
+from calibgraph.files import cannot_write, require_place_for_folder, sync_folder
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
 from calibgraph.tracking.assessment import Update
-from calibgraph.tracking.frame_order import StreamFrame, as_kept, frame_of
+from calibgraph.tracking.frames import StreamFrame, as_kept, frame_of
 from calibgraph.tracking.state_bytes import StateError, decode, encode
-from calibgraph.tracking.state_database import StateDatabase
 from calibgraph.tracking.tracker import IncrementalCalibrator, Outcome
 
+DATABASE = "state.sqlite"
 _STATE_EVERY = 50  # updates, of which a restart repeats up to so many and those of one write
+_TABLE = "CREATE TABLE kept (number INTEGER PRIMARY KEY, content BLOB NOT NULL)"
+_VERSION = 0x43470003
+_OPEN = """
+    PRAGMA page_size=32768;
+    PRAGMA locking_mode=EXCLUSIVE;
+    PRAGMA journal_mode=WAL;
+    PRAGMA synchronous=FULL;
+    PRAGMA wal_autocheckpoint=128;
+    PRAGMA trusted_schema=OFF;
+    BEGIN EXCLUSIVE;
+"""
+"""Large pages halve the time of a state; a log of 128 pages has 4 MB, as by default."""
 
 
 class DurableCalibrator:
@@ -62,9 +83,9 @@ class DurableCalibrator:
                 _require_same(folder, self.tracker, rig, config or Config())
             else:
                 self.tracker = IncrementalCalibrator(begin() if begin else rig, config)
-                self._write_state()
+                self._database.write([], self.tracker.to_bytes())
         except BaseException:
-            self._database.close()
+            self.abandon()
             raise
         self.resumed = self.tracker.frame is not None
 
@@ -106,22 +127,21 @@ class DurableCalibrator:
             OSError: if they cannot be written; then close this, and make a new one.
         """
         state = self.tracker.to_bytes() if self._since >= _STATE_EVERY else None
-        before, left, groups = self._since, frames, []
-        found = [*self.tracker.update_all(frames)]
+        found, left, groups = [*self.tracker.update_all(frames)], iter(frames), []
         for one in found:
-            taken = 1 if isinstance(one, CorrespondenceError) else len(one)
-            if not isinstance(one, CorrespondenceError):
-                groups.append(tuple(map(as_kept, left[:taken])))
-            left = left[taken:]
+            if isinstance(one, CorrespondenceError):
+                next(left)
+            else:
+                groups.append(tuple(as_kept(next(left)) for _ in one))
         if groups:
             self._database.write([encode(tuple(groups))], state)
-            self._since = sum(map(len, groups)) + (0 if state else before)
+            self._since = sum(map(len, groups)) + (0 if state else self._since)
         return found
 
     def close(self) -> None:
         """Write the state and release the folder: a restart has nothing to repeat."""
         try:
-            self._write_state()
+            self._database.write([], self.tracker.to_bytes())
         finally:
             self.abandon()
 
@@ -131,9 +151,6 @@ class DurableCalibrator:
         For a tracker that may be in the middle of an update, as after an error.
         """
         self._database.close()
-
-    def _write_state(self) -> None:
-        self._database.write([], self.tracker.to_bytes())
 
     def __enter__(self) -> Self:
         return self
@@ -180,3 +197,117 @@ def _without_guess(rig: Rig) -> dict[str, object]:
     for camera in content["cameras"].values():
         del camera["T_camera_lidar"]
     return content
+
+
+class StateDatabase:
+    """The state of one tracker in a folder, locked against a second process.
+
+    Args:
+        folder: where the state is kept; made if it is not there.
+
+    Raises:
+        FileError: if another process uses the folder, or its database is damaged or of another
+            program.
+        OSError: if it cannot be written.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        require_place_for_folder(folder)
+        new = [part for part in (folder, *folder.parents) if not part.exists()]
+        folder.mkdir(parents=True, exist_ok=True)
+        for part in new:
+            sync_folder(part.parent)
+        self._path = folder / DATABASE
+        try:
+            self._connection = sqlite3.connect(
+                self._path, timeout=0, isolation_level=None, check_same_thread=False
+            )
+        except sqlite3.Error as error:
+            raise cannot_write(self._path, error) from error
+        try:
+            is_new = self._is_new()
+            self._connection.executescript(_OPEN)
+            if is_new:
+                self._connection.execute(_TABLE)
+                self._connection.execute(f"PRAGMA user_version={_VERSION}")
+            self._connection.execute("COMMIT")
+        except BaseException as error:
+            self.close()
+            if isinstance(error, sqlite3.Error):
+                raise self._unusable(error) from error
+            raise
+
+    def write(self, inputs: Sequence[bytes], state: bytes | None = None) -> None:
+        """Add inputs; they are on disk when this returns, all or none.
+
+        Args:
+            inputs: in their order.
+            state: replaces that of the database and all inputs so far, which led to it.
+
+        Raises:
+            OSError: if they cannot be written; what was there is safe, and all is closed.
+        """
+        contents, execute = [*inputs], self._connection.execute
+        try:
+            execute("BEGIN")
+            (last,) = execute("SELECT max(number) FROM kept").fetchone()
+            if state is not None:
+                execute("DELETE FROM kept")
+                contents.insert(0, state)
+            rows = enumerate(contents, 0 if last is None else last + 1)
+            self._connection.executemany("INSERT INTO kept VALUES (?, ?)", rows)
+            execute("COMMIT")
+        except BaseException as error:
+            self.close()  # whether it is on disk is unknown
+            if isinstance(error, sqlite3.Error):
+                full = getattr(error, "sqlite_errorcode", None) == sqlite3.SQLITE_FULL
+                number = errno.ENOSPC if full else errno.EIO
+                raise cannot_write(self._path, error, number) from error
+            raise
+
+    def close(self) -> None:
+        """Release the folder; nothing is left to write."""
+        self._connection.close()
+
+    def read(self) -> list[bytes]:
+        """The state and the inputs after it; nothing of a new database.
+
+        The last input may be one whose write has not returned.
+
+        Raises:
+            FileError: if it is damaged.
+        """
+        try:
+            (state,) = self._connection.execute("PRAGMA integrity_check(1)").fetchone()
+            rows = self._connection.execute("SELECT * FROM kept ORDER BY number").fetchall()
+        except sqlite3.Error as error:
+            raise self._unusable(error) from error
+        if state != "ok":
+            raise _damaged(self._path, state)
+        for expected, (number, content) in enumerate(rows, rows[0][0] if rows else 0):
+            if number != expected or not isinstance(content, bytes):
+                raise _damaged(self._path, f"row {expected} is missing")
+        return [content for _, content in rows]
+
+    def _is_new(self) -> bool:
+        """Whether there is nothing yet; the database of another is refused before it is changed."""
+        schema = self._connection.execute("SELECT sql FROM sqlite_schema").fetchmany(2)
+        (version,) = self._connection.execute("PRAGMA user_version").fetchone()
+        if schema and (schema, version) != ([(_TABLE,)], _VERSION):
+            message = "is of another program or version; choose another folder"
+            raise FileError(self._path, message)
+        return not schema
+
+    def _unusable(self, error: sqlite3.Error) -> Exception:
+        code = getattr(error, "sqlite_errorcode", 0) & 0xFF
+        if code == sqlite3.SQLITE_BUSY:
+            message = "is in use by another process; stop that one, or choose another folder"
+            return FileError(self._path.parent, message)
+        if code in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB):
+            return _damaged(self._path, error)
+        return cannot_write(self._path, error)
+
+
+def _damaged(path: Path, why: object) -> FileError:
+    advice = "restore its folder from a copy, or choose another folder"
+    return FileError(path, f"is damaged ({why}); {advice}")

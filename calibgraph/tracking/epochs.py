@@ -12,18 +12,16 @@ from calibgraph.model.geometry import (
     to_T_lidar_camera,
 )
 from calibgraph.model.pose_kernel import logarithms
+from calibgraph.solver.robust import median_norm, robust_spread, scale_from
 from calibgraph.solver.within_place import WEAK
 from calibgraph.tracking.absorption import (
     add_to_totals,
-    bend_epoch,
-    consider_lens,
-    count_residuals,
+    count_epoch,
 )
 from calibgraph.tracking.estimate import EpochGraph, locate_places
 from calibgraph.tracking.events import Event
 from calibgraph.tracking.gate import Gated, frame_sums
 from calibgraph.tracking.moves import report_drift, select_walk, shift_between, update_evidence
-from calibgraph.tracking.noise import scale_of
 from calibgraph.tracking.state import STRENGTHS, State
 from calibgraph.tracking.sums import Numbers, Sums
 from factors import to_runs
@@ -50,18 +48,13 @@ def close_epoch(state: State, graph: EpochGraph) -> list[Event]:
     if len(state.sizes) > state.config.tracking.live_epochs:
         _summarize_oldest(state)
     _set_references(state, newest)
-    for camera in np.flatnonzero(state.started).tolist():
-        _count_epoch(state, camera)
-        scale = scale_of(state.histogram[camera], float(state.least[camera]), state.config)
-        state.put(camera, scales=scale)
+    first = int(state.numbers[state.closed])
     row_of = {name: row for row, name in enumerate(state.settled)}
     places = np.array([row_of.get(name, -1) for name in state.at], dtype=np.int64)
     for camera in range(len(state.names)):
         _regate(state, camera, places)
-        if any(state.findings.bend_sigmas):
-            bend_epoch(state, len(state.sizes) - 1, camera)
+        count_epoch(state, camera, first)
     state.sizes, state.poses = (*state.sizes, 0), np.concatenate([state.poses, newest[None]])
-    state.bends = np.concatenate([state.bends, np.zeros_like(state.bends[:1])])
     return report_drift(state)
 
 
@@ -89,16 +82,6 @@ def _newest(state: State, graph: EpochGraph) -> Array:
     return newest
 
 
-def _count_epoch(state: State, camera: int) -> None:
-    """Count the residuals of a camera's frames in the last epoch, and what its lens may do."""
-    own, first = state.matches_of(camera), int(state.numbers[state.closed])
-    if own is not None and own[0].frame[-1] >= first:
-        recent = own[0].select(own[0].frame >= first)
-        pose, scale = state.references[camera], state.scales[camera]
-        count_residuals(state, camera, Gated.at(pose, recent, scale))
-        state.put(camera, lens=consider_lens(state, camera, recent))
-
-
 def _set_references(state: State, references: Array) -> None:
     """Take all sums about other references."""
     steps = logarithms(state.references @ invert_each(references))
@@ -108,7 +91,7 @@ def _set_references(state: State, references: Array) -> None:
     )
     state.places = state.places.shift_reference(steps)
     state.walks = state.walks.shift_reference(
-        np.broadcast_to(steps[:, None], (*state.evidence.shape, 6))
+        np.broadcast_to(steps[:, None], (*state.walks.frames.shape, 6))
     )
     state.ungated = state.ungated.shift_reference(steps)
     state.steps, state.shared = state.steps - steps, state.shared - steps
@@ -117,7 +100,7 @@ def _set_references(state: State, references: Array) -> None:
 
 
 def _regate(state: State, camera: int, places: Numbers) -> None:
-    """Gate and linearize a camera's frames at the newest estimates.
+    """Measure the residuals of a camera's frames at the newest estimates, gate and linearize them.
 
     Each at the pose that its place has, if that is known; of a drifting camera, at its epoch's.
     Frames with too few matches within the gate keep those that were.
@@ -127,21 +110,26 @@ def _regate(state: State, camera: int, places: Numbers) -> None:
         camera: by its place in the rig.
         places: (R,) rows of the frames' places in ``state.steps``; -1: not known.
     """
-    own, scale = state.matches_of(camera), state.scales[camera]
+    own = state.matches_of(camera)
     if own is None:
         return
-    raw, within = own[0], own[1].copy()
+    raw, frames = own[0], own[0].frame_counts
     rows = np.searchsorted(state.numbers, raw.frame_numbers)
     epochs = np.repeat(np.arange(len(state.sizes)), state.sizes)[rows]
-    groups = np.where(state.walk[camera] > 0, epochs, 0)  # that are gated at one pose
-    for group in np.unique(groups).tolist():
-        of_group = np.repeat(groups == group, raw.frame_counts)
-        some = raw.select(of_group)
-        gated = Gated.at(state.poses[group, camera], some, scale)
-        few = np.repeat(~gated.enough, some.frame_counts)
-        within[of_group] = np.where(few, within[of_group], gated.inliers)
-        if gated.enough.any():
-            state.put(camera, curvature=gated.curvature(scale))
+    poses, scale = state.poses[epochs, camera], state.scales[camera]
+    sizes_px, sizes = raw.all_sizes(poses, to_runs(raw.frame_edges))
+    if raw.frames >= state.config.tracking.epoch_frames:
+        least = max(robust_spread(sizes), raw.least_spread)
+        scale = scale_from(robust_spread(sizes_px), least, state.config)
+    within = sizes_px * median_norm(raw.information) <= scale.gate_px
+    gated = Gated(
+        poses[-1], raw, within, np.add.reduceat(within, raw.frame_edges[:-1], dtype=float)
+    )
+    state.put(camera, scales=scale, share=gated.usual_share)
+    newest = gated.select(epochs == epochs[-1]) if state.walk[camera] else gated
+    if newest.enough.any():
+        state.put(camera, curvature=newest.curvature(scale))
+    within = np.where(np.repeat(gated.enough, frames), within, own[1])
     counts = np.add.reduceat(within, raw.frame_edges[:-1], dtype=np.int64)
     steps = _linearized_at(state, camera, epochs, places[rows])
     poses = retract_all(np.tile(state.references[camera], (len(steps), 1, 1)), steps)
@@ -189,9 +177,6 @@ def _summarize_oldest(state: State) -> None:
         elif before:  # what is left of the drift counts as of one place
             own = state.walks[camera, 0]
             state.places = state.places.with_camera_at(names[-1], camera, own)
-    bends = state.bends.copy()
-    bends[1] += bends[0]
-    state.bends = bends[1:]
     state.numbers, state.at = state.numbers[size:], state.at[size:]
     state.sums, state.sizes, state.poses = state.sums[size:], state.sizes[1:], state.poses[1:]
     for camera in range(len(state.names)):

@@ -7,23 +7,19 @@ update eliminates the places of the open epoch and exchanges one factor of that 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import gtsam
 import numpy as np
-from scipy.linalg import block_diag
 
 from calibgraph.arrays import Array, Mask
-from calibgraph.graph.by_place import QuadraticByPlace
-from calibgraph.graph.components import VarianceComponents, least_cost_of_distortion
+from calibgraph.graph.components import VarianceComponents, VarianceRatios, least_cost_of_distortion
 from calibgraph.graph.latent_poses import LatentPoseModel
-from calibgraph.graph.objective import join, objective_graph
-from calibgraph.graph.variables import camera_key
-from calibgraph.model.error_sources import ErrorSources
+from calibgraph.graph.objective import objective_graph
 from calibgraph.model.findings import error_components
-from calibgraph.model.geometry import pose_rows, retract_all, to_T_lidar_camera
+from calibgraph.model.geometry import pose_rows, retract_all
 from calibgraph.model.rig import RelativePose
 from calibgraph.solver.components import (
     Component,
@@ -34,20 +30,14 @@ from calibgraph.solver.components import (
 )
 from calibgraph.solver.covariance import ENOUGH_FRAMES, pose_equations
 from calibgraph.solver.error_model import Conflict, relative_pose_conflict
-from calibgraph.solver.places import fit_latent_poses, start_values
-from calibgraph.solver.sources import (
-    predict_variances,
-    sources_by_camera,
-    variances_by_source,
-)
 from calibgraph.solver.within_place import (
     WEAK,
     allow_for_few_frames,
     relative_covariance,
     split_excess,
 )
+from calibgraph.tracking.cause import sure_inflation
 from calibgraph.tracking.eliminate import Eliminated, block_diagonal, eliminate
-from calibgraph.tracking.noise import sure_inflation
 from calibgraph.tracking.state import Spread, State, rows_of
 from calibgraph.tracking.sums import Numbers, PlaceSums, Sums
 from calibgraph.tracking.window import Window
@@ -107,6 +97,7 @@ class Terms:
 
     Attributes:
         names: of the places.
+        known: (P,) their rows among the places whose optimum is known, -1 of new ones.
         seen: (P, n) which cameras have matches there.
         root: (P, n, 6, 6) Cholesky roots of the Hessians by weights.
         least: (n,) k of ``calibgraph.solver.within_place``.
@@ -117,6 +108,7 @@ class Terms:
     """
 
     names: tuple[str, ...]
+    known: Numbers
     seen: Mask
     root: Array
     least: Array
@@ -126,34 +118,27 @@ class Terms:
     robust_scale: float
 
     @staticmethod
-    def of(
-        state: State, sums: PlaceSums, rows: Numbers, spread: Spread, *, by_scatter: bool = False
-    ) -> Terms:
-        """Of some rows of the sums over all frames.
-
-        Args:
-            state: of the tracker.
-            sums: over all frames.
-            rows: of the places.
-            spread: of the frames.
-            by_scatter: whether cameras are displaced by what the scatter of frames shows alone.
-        """
-        own, frames, findings = sums.rows[rows], sums.frames[rows], state.findings
-        seen, places, prior = frames > 0, sums.places[rows], error_components()
+    def of(state: State, sums: PlaceSums, rows: Sequence[int], spread: Spread) -> Terms:
+        """Of some rows of the sums over all frames."""
+        own, findings, prior = sums.rows[rows], state.findings, error_components()
+        frames, places, settled = own.frames, sums.places[rows], state.settled
         names, weighted = tuple(sums.names[row] for row in rows), own.reweighted + WEAK
-        stated = (0.0 if by_scatter else findings.place_variance) * spread.efficiency
+        row_of = dict(zip(settled, range(len(settled)), strict=True))
+        known = np.array([row_of.get(name, -1) for name in names], dtype=np.int64)
+        stated = findings.place_variance * spread.efficiency
         excess = spread.excess + (stated * frames / places)[..., None, None] * np.eye(6)
+        seen = frames > 0
         alike = np.where(seen, places, np.inf).min(axis=1)
         sizes = findings.place_rotation_rad, findings.place_translation_m
-        cloud = _cloud_information(*sizes, state.ratios.cloud)
         return Terms(
             names,
+            known,
             seen,
-            np.asarray(np.linalg.cholesky(weighted)),
+            np.linalg.cholesky(weighted),
             spread.least,
             state.ratios.cameras * excess,
-            _minimum(state, own, names, weighted),
-            alike[:, None, None] * cloud,
+            _minimum(state, own, known, weighted),
+            alike[:, None, None] * _cloud_information(*sizes, state.ratios.cloud),
             prior.robust_sigmas if sums.count >= prior.robust_places else np.inf,
         )
 
@@ -172,39 +157,33 @@ class Terms:
         exact = _ROUNDING**2 * np.eye(6)
         return np.asarray(inverse.swapaxes(2, 3) @ self.excess @ inverse + exact)
 
-    def weighted_at_place(self, weights: Array) -> Array:
-        """The same, for (P, 1 + n) weights in the loss."""
-        return np.asarray(self.at_place / weights[:, 1:, None, None])
+    def apart(self, found: Eliminated, shown: Array, weights: Array) -> tuple[Array, Array]:
+        """Displacements of the clouds, (P, 6), and of the cameras, (P, n, 6)."""
+        return found.displacements(shown, self.at_place / weights[:, 1:, None, None])
 
     def squared(self, u: Array, v: Array) -> Array:
-        """(P, 1 + n) squared sigmas of the displacements of the clouds and of the cameras."""
+        """(P, 1 + n) squared sigmas of such displacements, in a loss that is not robust."""
         of_u = (u * (self.cloud @ u[..., None])[..., 0]).sum(axis=-1)
         of_v = (v * np.linalg.solve(self.at_place, v[..., None])[..., 0]).sum(axis=-1)
         return np.column_stack([of_u, np.where(self.seen, of_v, 0.0)])
 
-    def weigh(self, squared: Array) -> Array:
-        """(P, 1 + n) weights in the loss of Geman and McClure."""
-        return np.asarray((1.0 + squared / self.robust_scale**2) ** -2)
+    def weigh(self, u: Array, v: Array) -> Array:
+        """(P, 1 + n) weights of such displacements in the loss of Geman and McClure."""
+        return np.asarray((1.0 + self.squared(u, v) / self.robust_scale**2) ** -2)
 
-    def known_weights(self, state: State) -> tuple[Array, Mask]:
-        """(P, 1 + n) weights at the optimum of the last epoch, 1 of new places; which are new."""
-        weights = np.ones((len(self.names), 1 + self.seen.shape[1]))
-        row_of = {name: row for row, name in enumerate(state.settled)}
-        rows = [row_of.get(name, -1) for name in self.names]
-        new = np.array(rows, dtype=np.int64) < 0
-        if np.isfinite(self.robust_scale) and not new.all():
-            weights[~new] = state.weights[[row for row in rows if row >= 0]]
-        return weights, new
+    def known_weights(self, state: State) -> Array:
+        """(P, 1 + n) weights at the optimum of the last epoch, 1 of new places."""
+        weights, known = np.ones((len(self.names), 1 + self.seen.shape[1])), self.known >= 0
+        if np.isfinite(self.robust_scale) and known.any():
+            weights[known] = state.weights[self.known[known]]
+        return weights
 
     def open_weights(self, state: State, adjoint: Array) -> Array:
-        """(P, 1 + n) weights while an epoch is open: of new places, from a non-robust start."""
-        if not np.isfinite(self.robust_scale):
-            return np.ones((len(self.names), 1 + self.seen.shape[1]))
-        weights, new = self.known_weights(state)
-        for _ in range(_OPEN_WEIGHINGS if new.any() else 0):
-            found, at_place = self.eliminate(weights, adjoint), self.weighted_at_place(weights)
-            apart = found.displacements(state.shared, at_place)
-            weights[new] = self.weigh(self.squared(*apart))[new]
+        """The same while an epoch is open: of new places, from a non-robust start."""
+        weights, new = self.known_weights(state), self.known < 0
+        for _ in range(_OPEN_WEIGHINGS if np.isfinite(self.robust_scale) and new.any() else 0):
+            found = self.eliminate(weights, adjoint)
+            weights[new] = self.weigh(*self.apart(found, state.shared, weights))[new]
         return weights
 
 
@@ -214,19 +193,17 @@ def _cloud_information(rotation_rad: float, translation_m: float, ratio: float) 
     return np.asarray(np.linalg.inv(ratio * pose_covariance(rotation_rad**2, translation_m**2)))
 
 
-def _minimum(state: State, own: Sums, names: tuple[str, ...], weighted: Array) -> Array:
+def _minimum(state: State, own: Sums, known: Numbers, weighted: Array) -> Array:
     """(P, n, 6) from the references to the minima of quadratics with the Hessian by weights.
 
     The gradient is that of the robust cost, by its true Hessian, where matches of the place show
     the cameras at the optimum of the last epoch; of a new place, at its own minimum.
     """
-    row_of = {name: row for row, name in enumerate(state.settled)}
-    known = np.array([name in row_of for name in names], dtype=np.bool_)
-    at = np.zeros_like(own.gradient)
-    if known.any():
-        at[known] = state.steps[[row_of[name] for name in names if name in row_of]]
+    if (known < 0).all():
+        return np.asarray(-np.linalg.solve(own.hessian + WEAK, own.gradient[..., None])[..., 0])
+    at = np.where((known >= 0)[:, None, None], state.steps[known], 0.0)
     pull = own.gradient + (own.hessian @ at[..., None])[..., 0]
-    by = np.where(known[:, None, None, None], weighted, own.hessian + WEAK)
+    by = np.where((known >= 0)[:, None, None, None], weighted, own.hessian + WEAK)
     return np.asarray(at - np.linalg.solve(by, pull[..., None])[..., 0])
 
 
@@ -268,8 +245,12 @@ class EpochGraph:
         self.pose_graph = pose_priors(state)
         T = dict(zip(state.names, state.references, strict=True))
         self.prior = pose_equations(self.pose_graph, state.names, T)
-        self.window = Window(self.model(state, self.places, self.spread), state.references)
+        self.window = self.new_window(state)
         self._held: dict[frozenset[str], tuple[Array, Array]] = {}
+
+    def new_window(self, state: State) -> Window:
+        """What all places share, by the present ratios."""
+        return Window(self.shared_model(state, self.places, self.spread), state.references)
 
     def is_of(self, state: State) -> bool:
         """Whether the state is of the same epoch, with no change but more frames."""
@@ -308,7 +289,7 @@ class EpochGraph:
             T = self.window.T_camera_lidar(keys)
         else:
             T = retract_all(state.references, self.equation_5(sums))
-        covariance = self.window.covariance(keys) + block_diag(*state.lens_errors)
+        covariance = self.window.covariance(keys) + block_diagonal(state.lens_errors)
         few = np.repeat(sums.frames < ENOUGH_FRAMES, 6)
         covariance[few], covariance[:, few] = np.nan, np.nan
         return Estimate(T, covariance, sums, self._conflicts(state, sums), self.window)
@@ -316,13 +297,17 @@ class EpochGraph:
     def open_places(self, state: State, every: PlaceSums) -> Terms:
         """Those of the frames of the open epoch, and the last one; of a drift, all that it has."""
         names = {*state.at[state.closed :], *state.at[-1:]}
-        spread = self.spread if self._is_settled else spread_of(state, every)
         if not self._is_settled:  # that of all places changes with each frame
             self._held.clear()
             names |= {*every.names}
         found = np.flatnonzero(every.frames.any(axis=1)).tolist()
         rows = [row for row in found if every.names[row] in names]
-        return Terms.of(state, every, np.array(rows, dtype=np.int64), spread)
+        spread = self.open_spread(state, every)
+        return Terms.of(state, every, rows, spread)
+
+    def open_spread(self, state: State, every: PlaceSums) -> Spread:
+        """That of all frames; of many, the open epoch hardly changes it."""
+        return self.spread if self._is_settled else spread_of(state, every)
 
     def _others(self, state: State, touched: frozenset[str]) -> tuple[Array, Array]:
         """Information and vector of the closed places but some."""
@@ -332,9 +317,8 @@ class EpochGraph:
         size = 6 * len(state.names)
         if not rows:
             return np.zeros((size, size)), np.zeros(size)
-        terms = Terms.of(state, self.places, np.array(rows), self.spread)
-        weights, _ = terms.known_weights(state)
-        found = terms.eliminate(weights, self.window.adjoint)
+        terms = Terms.of(state, self.places, rows, self.spread)
+        found = terms.eliminate(terms.known_weights(state), self.window.adjoint)
         return found.information, found.vector
 
     def at_its_place(self, state: State) -> tuple[Array, Array]:
@@ -347,7 +331,7 @@ class EpochGraph:
         row, shown = own.names.index(state.at[-1]), self.window.shown
         weights = own.open_weights(state, self.window.adjoint)
         found = own.eliminate(weights, self.window.adjoint)
-        u, v = found.displacements(shown, own.weighted_at_place(weights))
+        u, v = own.apart(found, shown, weights)
         steps = shown + v[row] - (self.window.adjoint @ u[row])
         return own.squared(u, v)[row], retract_all(state.references, steps)
 
@@ -381,84 +365,44 @@ class EpochGraph:
             for place, pair in measured.items()
         }
 
-    def model(
-        self, state: State, sums: PlaceSums, spread: Spread, rows: Numbers | None = None
-    ) -> LatentPoseModel:
-        """The whole graph; without rows of places, that of what all of them share."""
-        terms = None if rows is None else Terms.of(state, sums, rows, spread)
-        findings, cameras, blocks = state.findings, state.names, {}
-        bends = state.bends.sum(axis=0)
-        sigmas, places = np.asarray(findings.bend_sigmas), 1 if terms is None else len(terms.names)
+    def shared_model(self, state: State, sums: PlaceSums, spread: Spread) -> LatentPoseModel:
+        """What all places share."""
+        findings, bends, n = state.findings, state.bends, len(state.names)
+        sigmas, shared = np.asarray(findings.bend_sigmas), state.ratios.shared
         size = len(sigmas)
-        shape = (places, len(cameras), size)
-        jacobian = np.zeros((len(cameras), 6, size))
-        shown, vector = np.zeros((*shape, size)), np.zeros(shape)
+        jacobian, shown, vector = np.zeros((n, 6, size)), np.zeros((size, size)), np.zeros(size)
         if any(findings.bend_sigmas):
             hessian, pulled = bends[:, :36].reshape(-1, 6, 6), bends[:, 36:54].reshape(-1, 6, size)
             jacobian = np.linalg.solve(hessian + WEAK, pulled) * sigmas
             weight = 1.0 / spread.mean_variance(findings.place_variance, sums.alike)
-            shown[0] = weight[:, None, None] * bends[:, 54:63].reshape(-1, size, size)
-            shown[0] *= np.outer(sigmas, sigmas)
-            vector[0] = weight[:, None] * bends[:, 63:] * sigmas
-        none = np.zeros((0, 6, 6))
-        for camera, name in enumerate(cameras):
-            at = np.zeros(0, np.int64) if terms is None else np.flatnonzero(terms.seen[:, camera])
-            reference = to_T_lidar_camera(state.references[camera])
-            minima = [] if terms is None else [*map(reference.retract, terms.minimum[at, camera])]
-            root = none if terms is None else terms.root[at, camera]
-            information = root @ root.swapaxes(1, 2) / spread.least[camera]
-            blocks[name] = QuadraticByPlace(at, minima, information)
-        each = np.tile(np.eye(6), (places, len(cameras), 1, 1))
+            shown = np.outer(sigmas, sigmas) * (weight @ bends[:, 54:63]).reshape(size, size)
+            vector = sigmas * (weight @ bends[:, 63:])
+        each = np.tile(np.eye(6), (1, n, 1, 1))
         components = VarianceComponents(
             cloud=np.eye(6),
-            cloud_at_place=np.asarray(np.linalg.inv(np.eye(6) if terms is None else terms.cloud)),
+            cloud_at_place=np.eye(6),
             camera=np.eye(6),
             pairs=np.eye(6),
-            at_place=each if terms is None else terms.at_place,
-            scatter_at_place=each if rows is None else _scatter(state, sums, rows, spread),
+            at_place=each,
+            scatter_at_place=each,
             distortion_jacobian=jacobian,
             pair_distortion_jacobian=np.zeros_like(jacobian),
             distortion_information=shown,
             distortion_vector=vector,
-            distortion_weight=np.ones(shape[:2]),
-            robust_scale=np.inf if terms is None else terms.robust_scale,
         )
-        components = common_error(components, findings.rigid_sigmas, findings.camera_share)
-        shared = state.ratios.shared
-        components = replace(
-            components,
-            cloud=shared * components.cloud,
-            camera=shared * components.camera,
-            distortion_size=shared,
-        )
-        return LatentPoseModel(cameras, blocks, (), self.pose_graph, components, state.config.of)
-
-    def whole_model(self, state: State) -> LatentPoseModel:
-        """The graph whose optimum and marginal are reported, with the poses of all places."""
-        sums = self.sums + state.sums[state.closed :].total()
-        every = every_place(state, self.places, sums)
-        rows = np.flatnonzero(every.frames.any(axis=1))
-        spread = self.spread if self._is_settled else spread_of(state, every)
-        found = enumerate(state.lens_errors)
-        lens_errors = {camera: covariance for camera, covariance in found if covariance.any()}
-        return replace(self.model(state, every, spread, rows), lens_errors=lens_errors)
-
-    def equation_5_graph(self, state: State) -> gtsam.NonlinearFactorGraph:
-        """Eq. 5 of the paper: priors, and a quadratic per camera."""
-        graph, at = join(self.pose_graph), gtsam.Values()
-        sums = self.sums + state.sums[state.closed :].total()
-        for camera, hessian in enumerate(sums.hessian):
-            if hessian.any():
-                key = camera_key(camera)
-                at.insert(key, to_T_lidar_camera(state.references[camera]))
-                factor = gtsam.HessianFactor(key, hessian, -sums.gradient[camera], 0.0)
-                graph.add(gtsam.LinearContainerFactor(factor, at))
-        return graph
+        prior = common_error(components, findings.rigid_sigmas, findings.camera_share)
+        components = VarianceRatios(shared=shared).scale(prior)
+        return SharedModel(state.names, {}, (), self.pose_graph, components, state.config.of)
 
 
-def _scatter(state: State, sums: PlaceSums, rows: Numbers, spread: Spread) -> Array:
-    """(P, n, 6, 6) covariance of a camera's matches at places by the scatter of frames alone."""
-    return Terms.of(state, sums, rows, spread, by_scatter=True).at_place
+@dataclass(frozen=True, eq=False)
+class SharedModel(LatentPoseModel):
+    """What all places share, of cameras whose matches are summed up."""
+
+    @cached_property
+    def matched(self) -> list[int]:
+        """All cameras, by number."""
+        return [*range(len(self.cameras))]
 
 
 def pose_priors(state: State) -> gtsam.NonlinearFactorGraph:
@@ -507,7 +451,7 @@ def settle(state: State) -> EpochGraph:
     """Find optimum, weights and variance ratios of the closed epochs; the graph with these."""
     state.spread = spread_of(state, closed_places(state))
     graph = EpochGraph(state)
-    rows = np.flatnonzero(graph.places.frames.any(axis=1))
+    rows = np.flatnonzero(graph.places.frames.any(axis=1)).tolist()
     shows_ratios = len(rows) > 1 or bool(len(rows) and state.rig.relative_poses)
     for left in range(_ROUNDS if shows_ratios else 0, -1, -1):
         terms = Terms.of(state, graph.places, rows, graph.spread)
@@ -519,8 +463,7 @@ def settle(state: State) -> EpochGraph:
         if ratios.is_near(state.ratios):
             break
         state.ratios = ratios
-        model = graph.model(state, graph.places, graph.spread)
-        graph.window = Window(model, state.references)
+        graph.window = graph.new_window(state)
     graph.settled = state.settled
     return graph
 
@@ -528,7 +471,7 @@ def settle(state: State) -> EpochGraph:
 def locate_places(state: State, graph: EpochGraph) -> None:
     """Find the optimum of all places, those of the open epoch too, for the present ratios."""
     every = every_place(state, graph.places, state.all_sums())
-    rows = np.flatnonzero(every.frames.any(axis=1))
+    rows = np.flatnonzero(every.frames.any(axis=1)).tolist()
     if len(rows) > 1:
         _fit(state, Terms.of(state, every, rows, graph.spread), graph.window)
 
@@ -538,13 +481,13 @@ def _fit(state: State, terms: Terms, window: Window) -> Eliminated:
 
     In a robust loss those of new places start from 1. The places are left eliminated.
     """
-    weights, _ = terms.known_weights(state)
+    weights = terms.known_weights(state)
     for _ in range(_MOST_WEIGHINGS):
         found = terms.eliminate(weights, window.adjoint)
         window.exchange(found.information, found.vector)
         shown = window.shown
-        u, v = found.displacements(shown, terms.weighted_at_place(weights))
-        new = terms.weigh(terms.squared(u, v))  # 1 in a loss that is not robust
+        u, v = terms.apart(found, shown, weights)
+        new = terms.weigh(u, v)  # 1 in a loss that is not robust
         if not new.size or np.abs(new - weights).max() < _SAME_WEIGHT:
             break
         weights = new
@@ -557,7 +500,7 @@ def _evidence(
     state: State, terms: Terms, found: Eliminated, window: Window
 ) -> dict[Component, Evidence]:
     """Per component its weighted sum of squares, and what of its freedom the data determine."""
-    weights, at_place = state.weights, terms.weighted_at_place(state.weights)
+    weights, at_place = state.weights, terms.at_place / state.weights[:, 1:, None, None]
     squared = weights * terms.squared(*found.displacements(state.shared, at_place))
     of_u, of_v = found.covariances(window.covariance_of_shown, at_place)
     open_u = np.trace(terms.cloud @ of_u, axis1=1, axis2=2) * weights[:, 0]
@@ -573,27 +516,3 @@ def _evidence(
         "cloud": Evidence(squared[:, 0].sum(), 6.0 * weights[:, 0].sum() - open_u.sum()),
         "cameras": Evidence(squared[:, 1:].sum(), 6.0 * present.sum() - open_v[terms.seen].sum()),
     }
-
-
-def error_sources(state: State, graph: EpochGraph, joint: Array | None) -> dict[str, ErrorSources]:
-    """Per camera, the shares of its error bar at the end of a drive.
-
-    None without error bars of all cameras, and where a camera drifts: then the graph of the places
-    is not the whole.
-
-    Args:
-        state: of the tracker.
-        graph: of its epoch.
-        joint: (6 N, 6 N) the reported covariance.
-    """
-    if joint is None or state.drifting:
-        return {}
-    model = graph.whole_model(state)
-    T = dict(zip(state.names, state.references, strict=True))
-    errors = fit_latent_poses(model, start_values(model, T))
-    if errors is None:
-        raise RuntimeError("a direction of a camera is not determined")
-    total = np.minimum(np.diag(errors.covariance), np.diag(joint))
-    parts, forecast = variances_by_source(errors), predict_variances(errors)
-    numbers = {name: number for number, name in enumerate(state.names)}
-    return sources_by_camera(joint, total, parts, forecast, numbers=numbers)

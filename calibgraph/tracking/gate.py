@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
@@ -52,10 +51,10 @@ class Gated:
         counts = np.add.reduceat(inliers, raw.frame_edges[:-1], dtype=np.float64)
         return Gated(T_camera_lidar, raw, inliers, counts)
 
-    @cached_property
-    def residuals(self) -> BlockResiduals:
-        """Of all their matches."""
-        return BlockResiduals.at(self.T_camera_lidar, self.raw)
+    @property
+    def usual_share(self) -> float:
+        """Median over the frames of the share of their matches within the gate."""
+        return float(np.median(self.counts / self.raw.frame_counts))
 
     @property
     def enough(self) -> Mask:
@@ -84,7 +83,8 @@ class Gated:
         block = self.raw.with_scale(scale).select(self.inliers)
         here = block.summarize(self.T_camera_lidar[None], runs, curvature=True)
         assert here.curvature is not None
-        true = here.curvature[0] + self.residuals.gate_hessians(scale)[0]
+        residuals = BlockResiduals.at(self.T_camera_lidar, self.raw)
+        true = here.curvature[0] + residuals.gate_hessians(scale)[0]
         inverse = np.linalg.inv(np.linalg.cholesky(here.hessian[0] + WEAK))
         values, vectors = np.linalg.eigh(inverse @ true @ inverse.T)
         return np.asarray((vectors * np.clip(values, *_CURVATURES)) @ vectors.T)

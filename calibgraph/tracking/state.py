@@ -7,10 +7,9 @@ of the state, whose arrays it replaces, and what fails leaves the state before i
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import accumulate, chain, pairwise
+from itertools import accumulate, pairwise
 from typing import Any, TypeVar
 
 import numpy as np
@@ -25,14 +24,14 @@ from calibgraph.model.geometry import pose_rows
 from calibgraph.model.rig import Rig
 from calibgraph.solver.matches import CameraBlock, merge
 from calibgraph.solver.robust import ResidualScale
+from calibgraph.tracking.cause import inflation
 from calibgraph.tracking.events import Event
-from calibgraph.tracking.noise import BINS, inflation
 from calibgraph.tracking.sums import Numbers, PlaceSums, Sums
 
 Item = TypeVar("Item")
 
 LEAST_FRAMES = 15  # for the scatter of a six-vector
-HISTORY = 50  # frames over which the residuals' size and the share of inliers are taken
+HISTORY = 50  # frames that a camera may start from
 STRENGTHS = np.array([0.0, 0.2, 1.0, 5.0])
 """The walks of a camera, in units of the configured one; the first is static."""
 COUNTS = "given", "used", "left_out", "failed", "absorbed", "repeated"
@@ -132,7 +131,7 @@ class State:
         steps: (P, n, 6) from the references to where matches at these show the cameras.
         weights: (P, 1 + n) of the cloud and the cameras there in the robust loss.
         shared: (n, 6) from the references to where matches show the cameras at all places.
-        bends: (E + 1, n, 66) of matches in the scan distortion, of older epochs and of each.
+        bends: (n, 66) of the matches of closed epochs in the scan distortion.
         walks: (n, 4) sums of older epochs, each discounted by its walk.
         evidence: (n, 4) log-likelihoods of the epochs, forgotten slowly.
         walk: (n,) which of the walks is selected.
@@ -147,10 +146,7 @@ class State:
         total_frames: (n,) and of frames.
         started: (n,) whether a camera has an estimate of its own.
         scales: of each camera's residuals.
-        histogram: (n, 2, b) of their sizes.
-        least: (n,) lower bounds of their whitened spread.
-        recent: (n, 50, 2) of the last absorbed frames, NaN before: share of inliers, median [px].
-        share: (n,) median of these shares.
+        share: (n,) of a frame's matches that is usually within the gate.
         absent: (n,) frames since the last usable one.
         moved_at: (n,) number of updates when a camera last moved, or -1.
         drift_reported_at: (n,) number of updates when its drift was last reported, or -1.
@@ -168,6 +164,7 @@ class State:
         stamp_ns: its time, or None.
         updates: number of updates.
         moves: the last events of moves and drifts.
+        knows_motion: whether the motion of frames is known; None before the first.
     """
 
     rig: Rig
@@ -200,9 +197,6 @@ class State:
     total_frames: Array
     started: Mask
     scales: tuple[ResidualScale, ...]
-    histogram: Array
-    least: Array
-    recent: Array
     share: Array
     absent: Numbers
     moved_at: Numbers
@@ -221,6 +215,7 @@ class State:
     stamp_ns: int | None = None
     updates: int = 0
     moves: tuple[Event, ...] = ()
+    knows_motion: bool | None = None
 
     @staticmethod
     def initial(rig: Rig, config: Config) -> State:
@@ -249,7 +244,7 @@ class State:
             steps=np.zeros((0, n, 6)),
             weights=np.ones((0, 1 + n)),
             shared=np.zeros((n, 6)),
-            bends=np.zeros((2, n, BEND)),
+            bends=np.zeros((n, BEND)),
             walks=Sums.zeros(n, walks),
             evidence=np.zeros((n, walks)),
             walk=np.zeros(n, np.int64),
@@ -264,9 +259,6 @@ class State:
             total_frames=np.zeros(n),
             started=np.zeros(n, np.bool_),
             scales=(ResidualScale(1.0, 1.0, 1.0, 1.0),) * n,
-            histogram=np.zeros((n, 2, BINS)),
-            least=np.zeros(n),
-            recent=np.full((n, HISTORY, 2), np.nan),
             share=np.ones(n),
             absent=np.zeros(n, np.int64),
             moved_at=np.full(n, -1),
@@ -280,7 +272,9 @@ class State:
 
     def draft(self) -> State:
         """A copy whose arrays may be replaced."""
-        return copy.copy(self)
+        found = object.__new__(State)  # copy.copy makes ten times the calls
+        vars(found).update(vars(self))
+        return found
 
     def put(self, camera: int, **values: Any) -> None:
         """Replace one camera's part of some arrays or tuples."""
@@ -321,17 +315,6 @@ class State:
         return [*accumulate(self.sizes, initial=0)]
 
     @property
-    def knows_motion(self) -> bool | None:
-        """Whether that of the frames whose matches are kept is known; None if there are none."""
-        tables = (table for own in self.waiting for table in own if len(table))
-        first = next(tables, None)
-        if first is not None:
-            return first.twist_per_s is not None
-        set_aside = (one.raw for own in self.outliers for one in own)
-        kept = next(chain(chain.from_iterable(self.blocks), set_aside), None)
-        return None if kept is None else kept.block.motion is not None
-
-    @property
     def drifting(self) -> list[int]:
         """The cameras that are followed by a random walk, by their places in the rig."""
         found: list[int] = self.walk.nonzero()[0].tolist()
@@ -360,11 +343,6 @@ class State:
     def rig_at(self, T_camera_lidar: Array) -> Rig:
         """The rig with (n, 4, 4) estimates."""
         return self.rig.moved_to(dict(zip(self.names, T_camera_lidar, strict=True)))
-
-    def known_recent(self, camera: int) -> Array:
-        """(f, 2) of the last absorbed frames."""
-        own = self.recent[camera]
-        return np.asarray(own[~np.isnan(own[:, 0])])
 
     def walk_variance(self, strengths: Array, frames: int) -> Array:
         """(w, 6) variance of walks of (w,) strengths, in units of the configured one."""

@@ -6,12 +6,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise, takewhile
 from pathlib import Path
 
-import gtsam
 import numpy as np
 
 from calibgraph.errors import CorrespondenceError, FileError
 from calibgraph.files import require_file, write_bytes
-from calibgraph.graph.latent_poses import latent_pose_graph
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences, concatenate
@@ -35,7 +33,6 @@ from calibgraph.tracking.absorption import (
     start_cameras,
 )
 from calibgraph.tracking.assessment import (
-    MeasureOnFrames,
     Update,
     make_updates,
     to_calibration,
@@ -51,13 +48,11 @@ from calibgraph.tracking.estimate import (
     spread_of,
 )
 from calibgraph.tracking.events import Event
-from calibgraph.tracking.frame_order import (
+from calibgraph.tracking.frames import (
     StreamFrame,
     frame_of,
     prepared,
-    share_last_points,
-    unsolvable,
-    without_repeats,
+    repeated_cameras,
 )
 from calibgraph.tracking.gate import Gated
 from calibgraph.tracking.moves import (
@@ -118,25 +113,11 @@ class IncrementalCalibrator:
         visited = *self._state.places.names[1:], *self._state.at
         return tuple(reversed(dict.fromkeys(reversed(visited))))
 
-    def calibration(
-        self, measure: MeasureOnFrames | None = None, *, sources: bool = False
-    ) -> Calibration:
-        """The present estimate as a batch's result; posteriors by images widen its error bars."""
+    def calibration(self) -> Calibration:
+        """The present estimate as a batch's result."""
         graph = self._graph_of(self._state)
         self._estimate = self._estimate or graph.solve(self._state)
-        return to_calibration(self._state, graph, self._estimate, measure, sources=sources)
-
-    @property
-    def graph(self) -> gtsam.NonlinearFactorGraph:
-        """The graph whose optimum and marginal are reported, as :meth:`Solution.graph`.
-
-        Its variables are those of ``calibgraph.graph.variables``; the matches of a camera at a
-        place are one factor. With a preset of the paper it is Eq. 5, without its marginal.
-        """
-        graph = self._graph_of(self._state)
-        if self.config.preset != "auto":
-            return graph.equation_5_graph(self._state)
-        return latent_pose_graph(graph.whole_model(self._state))
+        return to_calibration(self._state, self._estimate)
 
     def update(
         self, table: Correspondences, *, frame: int | None = None, place: str | int | None = None
@@ -191,7 +172,12 @@ class IncrementalCalibrator:
         except BaseException as error:
             self._graph = self._estimate = None
             if isinstance(error, UNSOLVABLE):
-                raise unsolvable(group[0].frame, error) from error
+                number, why = group[0].frame, str(error).strip().splitlines()[0]
+                raise CorrespondenceError(
+                    f"frame {number}: with its matches the estimate cannot be solved for ({why}); "
+                    "it is left out",
+                    frame=number,
+                ) from error
             raise
         self._state, self._graph, self._estimate = state, graph, estimate
         return updates
@@ -215,14 +201,14 @@ class IncrementalCalibrator:
             if _columns(group[0].table) != _columns(one.table):
                 break
             group.append(one)
-        if not group[1:] or not any(share_last_points(state, one.table) for one in group):
+        if not group[1:]:
             return group
-        alone = [*takewhile(lambda one: without_repeats(state, one.table) is one.table, group)]
+        alone = [*takewhile(lambda one: not repeated_cameras(state, one.table), group)]
         return alone or group[:1]
 
     def _take_in(self, state: State, group: Sequence[StreamFrame]) -> tuple[EpochGraph, Taken]:
         """Absorb the matches that agree, set aside the others, detect events."""
-        group, table, blocks = _preprocessed(state, group, self._graph_of(state).rig)
+        group, table, repeated, blocks = _preprocessed(state, group, self._graph_of(state).rig)
         gated = _gate(state, blocks)
         usual = _count_usual(state, group, blocks, gated)
         if usual < len(group):
@@ -240,7 +226,7 @@ class IncrementalCalibrator:
             events = start_cameras(state, table, blocks)
         taken: Taken = []
         for one, own in zip(group, used, strict=True):
-            count_repeats(state, one.table, table if len(group) == 1 else one.table)
+            count_repeats(state, one.table, repeated)
             events += count_absent(state, own, one)
             taken.append((one, events, own))
             events = []
@@ -320,41 +306,45 @@ def _columns(table: Correspondences) -> tuple[object, ...]:
 
 def _preprocessed(
     state: State, group: Sequence[StreamFrame], rig: Rig
-) -> tuple[Sequence[StreamFrame], Correspondences, dict[int, CameraBlock]]:
+) -> tuple[Sequence[StreamFrame], Correspondences, list[int], dict[int, CameraBlock]]:
     """Frames that can be taken in at once; their matches as given, and preprocessed by camera.
 
-    The first alone, without what it repeats, where one of them repeats another one.
+    The first alone, where one of them repeats another one; without the cameras of its table that
+    repeat themselves, whose numbers are in between.
 
     Args:
         state: of the tracker.
         group: the frames.
         rig: at the estimates.
     """
-    if len(group) == 1:
-        table = without_repeats(state, group[0].table)
-    else:
+    table, found = group[0].table, dict[int, CameraBlock]()
+    repeated = repeated_cameras(state, table) if len(group) == 1 else []
+    if repeated:
+        table = table.select(~np.isin(table.camera_index, repeated))
+    elif len(group) > 1:
         table = concatenate([one.table for one in group])
-    found = dict[int, CameraBlock]()
     if not len(table):
-        return group, table, found
+        return group, table, repeated, found
     config, cameras = state.config, [*state.rig.cameras.values()]
-    usable = table.without_cameras(config.excluded_cameras)
+    usable = table.without_cameras(config.excluded_cameras) if config.excluded_cameras else table
     numbers = camera_numbers(rig, usable)
     confident = are_projectable(rig, usable, numbers) & (usable.confidence >= config.confidence_min)
     rows = best_in_cell(rig, usable, numbers, config, among=confident)
-    kept, numbers = usable.select(rows), numbers[rows]
-    if len(group) > 1 and not np.array_equal(number_repeats(kept, numbers), kept.frame):
-        return _preprocessed(state, group[:1], rig)
-    capped = within_cap(kept, numbers, config) if len(kept) > config.matches_max else None
-    if capped is not None:
-        kept, numbers = kept.select(capped), numbers[capped]
+    numbers = numbers[rows]
+    if len(group) > 1:
+        kept = usable.select(rows)
+        if not np.array_equal(number_repeats(kept, numbers), kept.frame):
+            return _preprocessed(state, group[:1], rig)
+    if len(rows) > config.matches_max:
+        capped = within_cap(usable.select(rows), numbers, config)
+        rows, numbers = (rows, numbers) if capped is None else (rows[capped], numbers[capped])
     edges = np.searchsorted(numbers, np.arange(len(cameras) + 1)).tolist()
     for camera, (first, end) in enumerate(pairwise(edges)):
         if end - first >= MIN_MATCHES:
-            block = camera_block(cameras[camera], kept.select(slice(first, end)), config)
+            block = camera_block(cameras[camera], usable.select(rows[first:end]), config)
             block = block if len(group) == 1 else _with_enough(block)
             found |= {camera: block} if len(block) else {}
-    return group, table, found
+    return group, table, repeated, found
 
 
 def _with_enough(block: CameraBlock) -> CameraBlock:

@@ -45,7 +45,6 @@ SOLUTION_CHECKS: tuple[Callable[[Evidence], Checks], ...] = (
     solution_checks.assumed_spread_checks, # does the configured loss scale suit the residuals?
     lens_checks.intrinsics_checks,         # would another lens explain the residuals?
     lens_checks.offset_checks,             # would images of another time?
-    solution_checks.bootstrap_checks,      # does a bootstrap give the reported covariance?
     solution_checks.prior_share_checks,    # how much of it comes from the priors?
 )  # fmt: skip
 """Checks of a solution, from correspondences alone; those that name a cause come first."""

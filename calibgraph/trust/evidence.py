@@ -17,7 +17,6 @@ from calibgraph.model.geometry import pair_covariances, pose_rows, twist_between
 from calibgraph.model.lens import LensEstimate
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import TOLERANCE, Check
-from calibgraph.solver.covariance import bootstrap_covariances
 from calibgraph.solver.error_model import Conflict
 from calibgraph.solver.matches import CameraBlock
 from calibgraph.solver.solution import Solution
@@ -82,8 +81,6 @@ class Evidence:
             matches determine none.
         joint_covariance: (6 N, 6 N) of both, the wider one; cameras that are held are unknown by a
             radian and a metre.
-        bootstrap: per camera (6, 6) scatter of re-solves from frames drawn again; empty if not
-            wanted.
         prior_shares: per camera, which share of its result comes from priors and relative poses.
     """
 
@@ -93,7 +90,6 @@ class Evidence:
     tied: Sequence[tuple[str, ...]]
     bars: ImagePosteriors | None
     joint_covariance: Array | None
-    bootstrap: dict[str, Array]
     prior_shares: dict[str, float]
 
     @property
@@ -168,7 +164,7 @@ def gather(
         measure: gives the posteriors by the images.
         excluded: cameras that the user excluded.
     """
-    cameras, config = tuple(solution.T_camera_lidar), solution.config
+    cameras = tuple(solution.T_camera_lidar)
     tied, known = _tied(solution), solution.covariance
     bars, joint = None, None
     if known is not None:
@@ -176,8 +172,7 @@ def gather(
         own = {name: known[rows[name], rows[name]] for group in tied for name in group}
         bars = ImagePosteriors(cameras, known, measure(own, tied))
         joint = bars.widen(known)
-    drawn = bootstrap_covariances(solution.fitted, config.bootstrap, config.seed)
-    return Evidence(solution, guess, excluded, tied, bars, joint, drawn, prior_shares(solution))
+    return Evidence(solution, guess, excluded, tied, bars, joint, prior_shares(solution))
 
 
 def _tied(solution: Solution) -> list[tuple[str, ...]]:

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from calibgraph.matching.run import MatchingRun
+from calibgraph.matching.run import MatchingRun, RoundSummary
 from calibgraph.matching.structure.acceptance import FEW_FRAMES, SEARCH, probability_by_chance
 from calibgraph.matching.structure.global_search import ALONE
 from calibgraph.model.findings import MatcherFindings
@@ -108,11 +108,16 @@ REMATCH_DEG, REMATCH_M = 0.5, 0.08
 
 def last_round_checks(run: MatchingRun) -> Checks:
     """How far the last of several rounds of matching still moved the cameras."""
-    if len(run.rounds) == 1:
-        return {}
+    return (
+        {} if len(run.rounds) == 1 else check_moves(run.rounds[-1], run.solution.config.tolerance)
+    )
+
+
+def check_moves(summary: RoundSummary, tolerance: tuple[float, float]) -> Checks:
+    """How far a round moved each camera, for a tolerance [deg, cm]."""
     keys = ("last_round_rotation", "moved_deg"), ("last_round_translation", "moved_cm")
-    rows = [(threshold(key, run.solution.config.tolerance), of) for key, of in keys]
-    return {n: [row.check(moved[of]) for row, of in rows] for n, moved in run.rounds[-1].items()}
+    rows = [(threshold(key, tolerance), of) for key, of in keys]
+    return {n: [row.check(moved[of]) for row, of in rows] for n, moved in summary.items()}
 
 
 def repeated_file_checks(run: MatchingRun) -> Checks:

@@ -16,6 +16,7 @@ from calibgraph.solver.solution import Solution
 from calibgraph.trust.evidence import Checks, Estimate, Evidence
 from calibgraph.trust.thresholds import threshold
 from factors.columns import CLOCK
+from factors.conditioning import invert_or_none
 
 
 def estimate_checks(evidence: Evidence) -> Checks:
@@ -25,13 +26,13 @@ def estimate_checks(evidence: Evidence) -> Checks:
 
 def _estimate_of(evidence: Evidence, camera: str) -> Estimate:
     solution, block = evidence.solution, evidence.solution.inliers.blocks.get(camera)
-    sigmas = None if evidence.joint_covariance is not None else solution.data_sigmas
+    unknown, own = evidence.joint_covariance is None, solution.fitted.frame_sums.get(camera)
     return Estimate(
         has_matches=camera in solution.objective.blocks,
         used=0 if block is None else len(block.frame),
         frames=0 if block is None else len(block.frame_edges) - 1,
         covariance=evidence.covariance_by_matches(camera),
-        is_free=sigmas is not None and np.isinf(sigmas[evidence.cameras.index(camera)]).any(),
+        is_free=unknown and own is not None and invert_or_none(own.hessian.sum(axis=0)) is None,
         conflicts=tuple(c for c in solution.conflicts if camera in (c.pair.a, c.pair.b)),
         converged=solution.optimum.converged,
         terms=solution.terms,
@@ -164,17 +165,6 @@ def residuals_of(solution: Solution) -> dict[str, Residuals]:
     poses, scales = solution.T_camera_lidar, solution.scales
     blocks = solution.objective.blocks.items()
     return {n: BlockResiduals.at(poses[n], block).summary(scales[n]) for n, block in blocks}
-
-
-def bootstrap_checks(evidence: Evidence) -> Checks:
-    """Whether the reported covariance is as large as the bootstrap's, if there is one."""
-    row, checks = threshold("bootstrap_sigma"), {}
-    for name, bootstrap in evidence.bootstrap.items():
-        reported = evidence.covariance_by_matches(name)
-        if reported is not None:
-            ratio = float(np.sqrt(np.max(np.diag(bootstrap) / np.diag(reported))))
-            checks[name] = [row.check(ratio)]
-    return checks
 
 
 def prior_share_checks(evidence: Evidence) -> Checks:

@@ -127,9 +127,6 @@ THRESHOLDS: tuple[Threshold, ...] = (
     Threshold("assumed_spread", "residual spread over the assumed one", "at most", 2.0, 4.0,
               "times", "Does the configured loss scale suit the residuals?",
               "the matches are worse than loss_scale_px (delta) assumes"),
-    Threshold("bootstrap_sigma", "bootstrap sigma over reported sigma", "at most", 2.0, 5.0, "",
-              "Does a bootstrap over frames give the reported covariance?",
-              "the frames disagree more than the error bar allows"),
     # Above half, it shows the priors more than the data.
     Threshold("prior_share", "share of the priors in the result", "at most", 0.5, 1.0, "share",
               "How much of the result comes from priors and relative poses?"),
@@ -175,11 +172,6 @@ THRESHOLDS: tuple[Threshold, ...] = (
     Threshold("own_clouds", "score with the own clouds above that with neighbouring ones",
               "at least", -0.05, -0.2, "share", "Do images and clouds belong together?"),
     # while driving
-    # The verdict's own cut, at the end of `track --matcher structure`.
-    Threshold("beyond_tolerance", "probability of an error beyond the tolerance", "at most",
-              PASS_BELOW, math.inf, "share",
-              "How much of the posterior by the images and the matches is beyond the tolerance?",
-              "the images leave the pose more open than the matches"),
     # Above half, most new measurements contradict the estimate.
     Threshold("disagreeing_frames", "share of the last frames that disagree with the estimate",
               "at most", 0.5, 1.0, "share", "Do recent frames agree with the tracked estimate?"),

@@ -52,6 +52,7 @@ def test_a_right_rig_is_ok() -> None:
         assert camera.sigma is not None
         assert camera.detectable is not None
         assert (camera.detectable > 2.9 * camera.sigma).all()
+    assert audit.shown is not None and audit.shown.kept is None, "decoded frames"
 
 
 def test_the_camera_that_was_moved_is_wrong_and_the_others_are_ok() -> None:
@@ -247,11 +248,6 @@ def test_files_are_decoded_once(monkeypatch: pytest.MonkeyPatch) -> None:
             np.testing.assert_array_equal(frame.load_gray("left", camera), gray)
     assert len(read) == 2 * len(data.frames)
     assert set(read.values()) == {1}
-
-
-def test_an_audit_keeps_no_decoded_frames() -> None:
-    audit = check_by_table(TRUTH)
-    assert audit.shown is not None and audit.shown.kept is None
 
 
 def test_the_recording_of_a_result_is_known_by_its_content_wherever_it_lies(

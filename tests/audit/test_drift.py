@@ -109,22 +109,6 @@ def test_a_wide_result_does_not_decide_between_two_sharp_ones() -> None:
     assert "it may be b that changed" in found.cameras["left"][0].reason
 
 
-def test_a_steady_drift_is_a_trend_and_a_step_is_none() -> None:
-    rng = np.random.default_rng(7)
-    steps = [{"left": twist("pitch", 0.4 * day)} for day in range(7)]
-    given = {str(k): draw(rng, move) for k, move in enumerate(steps)}
-    found = calibgraph.drift(given, days=[2.0 * k for k in range(7)])
-    trend = found.trends["left"]
-    assert trend.changed
-    assert trend.unit == "day"
-    assert abs(np.degrees(trend.slope[0]) - 0.2) < 4 * np.degrees(trend.sigma[0])
-    assert not found.trends["right"].changed
-    step = calibgraph.drift(results(7, 7, r6={"left": twist("pitch", 2.0)}))
-    assert step.changed == (("6", "left"),)
-    assert not step.trends["left"].changed
-    assert "changes of single results explain it better" in step.trends["left"].reason
-
-
 def test_a_camera_that_failed_or_has_no_error_bar_takes_no_part() -> None:
     failed = Verdict((Check("convergence", "FAIL", "it did not converge"),))
     given = results(8, 5, r0={"left": twist("yaw", 5.0)}, r1={"right": twist("yaw", 5.0)})
@@ -191,12 +175,6 @@ def test_results_of_one_recording_are_named() -> None:
     assert found.same_recording == (("result 1", "result 3"),)
     assert found.same_recording_note.startswith("Made from one recording: result 1 and result 3.")
     assert calibgraph.drift(given[1:3]).same_recording_note == ""
-
-
-@pytest.mark.parametrize("days", [[0.0], [0.0, np.nan], [1e308, -1e308]])
-def test_there_is_a_day_for_each_result(days: list[float]) -> None:
-    with pytest.raises(ValueError, match="expected 2 numbers up to 1e"):
-        calibgraph.drift(results(13, 2), days=days)
 
 
 def test_unchanged_rigs_raise_at_most_one_false_alarm_in_a_hundred() -> None:

@@ -3,6 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from calibgraph.arrays import Array
 from calibgraph.audit.judgement import (
     POWER,
     detectable,
@@ -20,75 +21,51 @@ KNOWN = student_quantiles(np.inf, tail_of_axis(3))
 QUANTILE = KNOWN[0, 0]
 
 
-def deviation(axis: int, value: float) -> np.ndarray:
-    """A deviation in degrees or centimetres about or along one axis."""
-    twist = np.zeros(6)
-    twist[axis] = np.radians(value) if axis < 3 else value / 100
-    return twist
+def twist(turns_deg: tuple[float, float, float], shifts_cm: tuple[float, ...] = (0, 0, 0)) -> Array:
+    return np.array([*np.radians(turns_deg), *np.divide(shifts_cm, 100)])
 
 
-def test_a_significant_deviation_beyond_the_tolerance_is_wrong_and_its_axis_is_named() -> None:
-    status, reason = judge_deviation(deviation(1, -0.8), COVARIANCE, KNOWN, TOLERANCE)
-    assert status == "WRONG"
-    assert reason == "turned about y (yaw) by -0.80 deg (sigma 0.09)"
-    status, reason = judge_deviation(deviation(5, 15.0), COVARIANCE, KNOWN, TOLERANCE)
-    assert status == "WRONG"
-    assert "moved along z (ahead) by +15.00 cm" in reason
+def sigma(turn_deg: float, shift_cm: float = 1.0, **of_axis: float) -> Array:
+    """Of all axes; of some of them, numbered, another [rad, m]."""
+    found = np.repeat([np.radians(turn_deg), shift_cm / 100], 3)
+    for axis, value in of_axis.items():
+        found[int(axis[-1])] = value
+    return found
 
 
-def test_a_significant_deviation_within_the_tolerance_is_ok_and_named() -> None:
-    sharp = COVARIANCE / 16
-    status, reason = judge_deviation(deviation(0, 0.3), sharp, KNOWN, TOLERANCE)
-    assert status == "OK"
-    assert "within the tolerance, though significant" in reason
-    assert "x (pitch) by +0.30 deg" in reason
+NONE = (0.0, 0.0, 0.0)
+JUDGED = {
+    "beyond the tolerance": (
+        twist((0, -0.8, 0)), SIGMA, "WRONG", "turned about y (yaw) by -0.80 deg (sigma 0.09)"),
+    "a shift beyond it": (
+        twist(NONE, (0, 0, 15)), SIGMA, "WRONG", "moved along z (ahead) by +15.00 cm"),
+    "within it": (
+        twist((0.3, 0, 0)), SIGMA / 4, "OK",
+        "within the tolerance, though significant: turned about x (pitch) by +0.30 deg"),
+    "near it": (twist((0, 0, 0.45)), SIGMA, "CANNOT TELL", "check another recording"),
+    "0.70 deg in all": (twist((0.4, 0.4, 0.4)), sigma(0.05), "WRONG", "z (roll) by +0.40"),
+    "of two axes": (twist((0.4, -0.4, 0)), sigma(0.05), "WRONG", "y (yaw) by -0.40"),
+    "0.26 deg in all": (twist((0.15, 0.15, 0.15)), sigma(0.05), "OK", ""),
+    "0.47 deg in all": (twist((0.27, 0.27, 0.27)), sigma(0.05), "CANNOT TELL", ""),
+    "too large, but open": (
+        twist((0.1, 0.6, 0)), sigma(0.02, axis1=np.radians(0.3)), "CANNOT TELL", ""),
+    "none, with a wide turn": (
+        twist(NONE), sigma(0.09, 2, axis1=np.radians(0.9)), "CANNOT TELL", "all over the image"),
+    "none, with a wide shift": (
+        twist(NONE), sigma(0.09, 2, axis5=0.2), "CANNOT TELL", "within 10 m"),
+    "large, not significant": (twist((2.0, 0, 0)), 10 * SIGMA, "CANNOT TELL", ""),
+}  # fmt: skip
 
 
-def test_a_deviation_near_the_tolerance_cannot_be_told() -> None:
-    status, reason = judge_deviation(deviation(2, 0.45), COVARIANCE, KNOWN, TOLERANCE)
-    assert status == "CANNOT TELL"
-    assert "check another recording" in reason
-
-
-@pytest.mark.parametrize(
-    ("turns_deg", "status"),
-    [
-        ((0.4, 0.4, 0.4), "WRONG"),  # 0.70 deg in all, each within 0.5 deg
-        ((0.4, -0.4, 0.0), "WRONG"),
-        ((0.15, 0.15, 0.15), "OK"),  # 0.26 deg
-        ((0.27, 0.27, 0.27), "CANNOT TELL"),  # 0.47 deg
-    ],
-)
-def test_the_tolerance_is_of_the_whole_turn(
-    turns_deg: tuple[float, float, float], status: str
+@pytest.mark.parametrize("name", JUDGED)
+def test_a_deviation_is_judged_by_the_whole_turn_and_shift_and_its_axes_are_named(
+    name: str,
 ) -> None:
-    twist = np.array([*np.radians(turns_deg), 0.0, 0.0, 0.0])
-    covariance = np.diag(np.repeat([np.radians(0.05), 0.01], 3) ** 2)
-    found, reason = judge_deviation(twist, covariance, KNOWN, TOLERANCE)
-    assert found == status
+    xi, bar, status, words = JUDGED[name]
+    found, reason = judge_deviation(xi, np.diag(bar**2), KNOWN, TOLERANCE)
+    assert found == status and words in reason
     if status == "WRONG":
-        assert reason.count("turned about") == np.count_nonzero(turns_deg)
-
-
-def test_axes_that_are_not_significant_do_not_make_a_turn_too_large() -> None:
-    sigma = np.repeat([np.radians(0.02), 0.01], 3)
-    sigma[1] = np.radians(0.3)
-    twist = np.array([*np.radians((0.1, 0.6, 0.0)), 0.0, 0.0, 0.0])
-    assert judge_deviation(twist, np.diag(sigma**2), KNOWN, TOLERANCE)[0] == "CANNOT TELL"
-
-
-@pytest.mark.parametrize(("axis", "words"), [(1, "all over the image"), (5, "within 10 m")])
-def test_no_deviation_with_a_wide_error_bar_cannot_be_told(axis: int, words: str) -> None:
-    wide = SIGMA.copy()
-    wide[axis] *= 10
-    status, reason = judge_deviation(np.zeros(6), np.diag(wide**2), KNOWN, TOLERANCE)
-    assert status == "CANNOT TELL"
-    assert words in reason
-
-
-def test_a_large_deviation_that_is_not_significant_is_not_called_wrong() -> None:
-    wide = 100 * COVARIANCE
-    assert judge_deviation(deviation(0, 2.0), wide, KNOWN, TOLERANCE)[0] == "CANNOT TELL"
+        assert reason.count("turned about") == np.count_nonzero(xi[:3])
 
 
 def test_one_of_a_thousand_unchanged_rigs_has_a_significant_axis() -> None:

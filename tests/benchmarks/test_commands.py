@@ -6,12 +6,10 @@ import os
 import subprocess
 import sys
 
-import numpy as np
 import pytest
 
 from benchmarks import tables
 from benchmarks.speed import gate
-from calibgraph.matching.structure.score_kernel import pad
 from tests.conftest import ROOT
 
 MODULES = sorted(
@@ -51,25 +49,6 @@ def test_tables_are_markdown_below_the_command_that_made_them(
         "Times:\n\n| solver | time [s] |\n| ---    |      --- |\n"
         "| ours   |      0.1 |\n| theirs |     12.0 |\n"
     )
-
-
-def test_multiply_adds_are_those_of_the_shifts_inside_the_image() -> None:
-    places = np.array([[(0, 0), (2, 1)], [(5, 4), (6, 5)]], np.int32)  # the second leaves earlier
-    basis = np.zeros((2, 2, 4), np.float32)
-    basis[1, 0, 2] = 1.0
-    call = {
-        "padded": pad(np.zeros((7, 9), np.float32)), "places": places, "counts": np.array([2, 2]),
-        "basis": basis, "origin": np.array([-3, -2]), "grids": np.zeros((1, 5, 7), np.float32),
-    }  # fmt: skip
-    shifts = [
-        sum(
-            all(0 <= u + x < 9 and 0 <= v + y < 7 for u, v in window)
-            for x in range(-3, 4)
-            for y in range(-2, 3)
-        )
-        for window in places
-    ]
-    assert gate.multiply_adds(call) == 2 * (4 * shifts[0] + 6 * shifts[1])
 
 
 def test_the_gate_names_what_became_slower_than_the_release() -> None:

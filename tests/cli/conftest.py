@@ -1,10 +1,11 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from calibgraph import MatcherErrors, perturb, simulate_correspondences
+from calibgraph import MatcherErrors, Rig, perturb, simulate_correspondences
 from tests.conftest import make_pair
 
 
@@ -22,6 +23,13 @@ def save_problem(folder: Path) -> Path:
     pair.save(folder / "truth.yaml")
     perturb(pair, rotation_deg=2, translation_m=0.2).save(folder / "rig.yaml")
     return folder
+
+
+def words_to_solve(folder: Path, rig: Rig, **simulated: Any) -> tuple[str | Path, ...]:
+    """The words that solve a simulated table of a rig, saved in a folder, into ``out``."""
+    rig.save(folder / "rig.yaml")
+    simulate_correspondences(rig, **simulated).save(folder / "table.parquet")
+    return "solve", folder / "rig.yaml", folder / "table.parquet", "--out", folder / "out"
 
 
 @pytest.fixture

@@ -53,7 +53,6 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write(folder, four__yaml=four, spaced__yaml=spaced)
     write(folder, info__yaml=CAMERA_INFO, chain__yaml=KALIBR, car__urdf=URDF, eye__urdf=eye,
           two__urdf=two, calib__json=json.dumps(KOIDE))  # fmt: skip
-    (folder / "pose_cam_to_velo.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n")
     return folder
 
 

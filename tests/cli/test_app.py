@@ -8,27 +8,12 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from calibgraph import load_calibration, load_rig
 from calibgraph.cli import app
 from calibgraph.parallel import count_cores
 from tests.cli.conftest import error_line
 from tests.conftest import SAMPLE, Call
-
-
-@pytest.mark.slow
-def test_a_camera_that_sees_nothing_of_the_cloud_fails_alone(call: Call, tmp_path: Path) -> None:
-    rig = load_rig(SAMPLE)
-    backwards = np.diag([-1.0, 1.0, -1.0, 1.0]) @ rig.T_camera_lidar["front_left"]
-    # Behind the rig the sample's LiDAR returns nothing at all.
-    rig.moved_to({"front_left": backwards}).save(tmp_path / "rig.yaml")
-    code, _, _ = call("calibrate", SAMPLE, "--rig", tmp_path / "rig.yaml",
-                      "--out", tmp_path / "out")  # fmt: skip
-    assert code == 1
-    verdicts = load_calibration(tmp_path / "out").camera_verdicts
-    assert {name for name, found in verdicts.items() if found.status == "FAIL"} == {"front_left"}
 
 
 def test_a_truncated_image_writes_nothing(call: Call, tmp_path: Path) -> None:
@@ -123,21 +108,24 @@ needed, packages = set(), packages_distributions()
 add("calibgraph")
 sys.meta_path.insert(0, Hidden())
 from calibgraph.cli.app import main
-main()
+for line in sys.argv[1:]:
+    sys.argv = ["calibgraph", *line.split()]
+    try:
+        main()
+    except SystemExit as done:
+        assert not done.code, line
 """
 
 
-@pytest.mark.parametrize(
-    "command",
-    [["doctor", SAMPLE],
-     ["calibrate", SAMPLE, "--frames", "0:2", "--search-deg", "4", "--search-m", "0.3"],
-     ["evaluate", SAMPLE / "rig.yaml", SAMPLE / "reference.yaml"], ["rig", SAMPLE / "rig.yaml"]],
-    ids=lambda words: words[0],
-)  # fmt: skip
-def test_commands_need_no_package_of_an_extra(command: list[str | Path], tmp_path: Path) -> None:
+def test_commands_need_no_package_of_an_extra(tmp_path: Path) -> None:
     """Those of ``pip install calibgraph`` alone are found, with all that they need."""
-    out = ["--out", tmp_path / "out"] if command[0] == "calibrate" else []
-    words = [sys.executable, "-c", WITHOUT_EXTRAS, *command, *out]
+    lines = (
+        f"evaluate {SAMPLE}/rig.yaml {SAMPLE}/reference.yaml",
+        f"rig {SAMPLE}/rig.yaml",
+        f"doctor {SAMPLE} --frames 0:2",
+        f"calibrate {SAMPLE} --frames 0:2 --search-deg 4 --search-m 0.3 --out {tmp_path}/out",
+    )
+    words = [sys.executable, "-c", WITHOUT_EXTRAS, *lines]
     done = subprocess.run(words, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
 

@@ -19,7 +19,7 @@ from calibgraph import (
     simulate_correspondences,
 )
 from calibgraph.model.places import Places
-from tests.cli.conftest import save_problem
+from tests.cli.conftest import error_line, save_problem, words_to_solve
 from tests.conftest import SAMPLE, Call, CommandRun, make_camera, run_command
 
 
@@ -161,6 +161,9 @@ def test_a_failed_calibration_exits_1_and_its_files_are_marked(problem: Path, ca
     ]
     content = yaml.safe_load((out / "calibration.yaml").read_text())
     assert content["error_bar_holds"]["left->right"] is False
+    export = ("export", out, "--format", "json", "--out", problem / "a.json")
+    assert "is FAIL, nothing was written" in error_line(*call(*export))
+    assert call(*export, "--even-if-failed")[0] == 0
 
 
 def test_calibrate_writes_a_result_a_report_and_pictures(calibrated_sample: CommandRun) -> None:
@@ -175,10 +178,7 @@ def test_calibrate_writes_a_result_a_report_and_pictures(calibrated_sample: Comm
 
 def test_names_are_printed_as_they_are(tmp_path: Path, call: Call) -> None:
     rig = Rig(cameras={"[red]": make_camera(), "[bold]b": make_camera((0, 0.5, 0))})
-    rig.save(tmp_path / "rig.yaml")
-    simulate_correspondences(rig, frames=6).save(tmp_path / "table.parquet")
-    code, _, stderr = call("solve", tmp_path / "rig.yaml", tmp_path / "table.parquet",
-                           "--out", tmp_path / "out")  # fmt: skip
+    code, _, stderr = call(*words_to_solve(tmp_path, rig, frames=6))
     assert code == 0
     assert "[red]" in stderr
     assert "[bold]b" in stderr
@@ -186,11 +186,7 @@ def test_names_are_printed_as_they_are(tmp_path: Path, call: Call) -> None:
 
 def test_a_rig_of_one_camera_is_solved(tmp_path: Path, call: Call) -> None:
     rig = Rig(cameras={"only": make_camera()})
-    rig.save(tmp_path / "rig.yaml")
-    simulate_correspondences(rig, frames=6).save(tmp_path / "table.parquet")
-    code, _, _ = call("solve", tmp_path / "rig.yaml", tmp_path / "table.parquet",
-                      "--out", tmp_path / "out")  # fmt: skip
-    assert code == 0
+    assert call(*words_to_solve(tmp_path, rig, frames=6))[0] == 0
     code, stdout, _ = call("evaluate", tmp_path / "out", tmp_path / "rig.yaml", "--json")
     assert json.loads(stdout)["pairs"] == {}
 

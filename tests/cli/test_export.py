@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
 import yaml
 
-from calibgraph import MatcherErrors, load_rig, simulate_correspondences, solve
+from calibgraph import load_rig
 from calibgraph.io.formats import EXPORT_FORMATS
-from tests.cli.conftest import error_line
-from tests.conftest import SAMPLE, Call, make_pair
+from tests.conftest import SAMPLE, Call
 from tests.io.formats.readers import READERS
 
 
@@ -40,14 +38,3 @@ def test_options_of_export_reach_the_file(call: Call, tmp_path: Path) -> None:
     kit = yaml.safe_load(out.read_text())["sensor_kit_base_link"]
     assert list(kit) == ["velodyne_top", "left/camera_link"]
     assert [kit["velodyne_top"][key] for key in ("x", "y", "z")] == [1, 2, 3]
-
-
-def test_a_failed_result_needs_the_flag(call: Call, tmp_path: Path) -> None:
-    nonsense = MatcherErrors(outlier_share=1.0)
-    solve(make_pair(), simulate_correspondences(make_pair(), errors=nonsense)).save(tmp_path)
-    arguments = ("export", tmp_path, "--format", "json", "--out", tmp_path / "a.json")
-    assert "is FAIL, nothing was written" in error_line(*call(*arguments))
-    assert not (tmp_path / "a.json").exists()
-    code, _, _ = call(*arguments, "--even-if-failed")
-    assert code == 0
-    assert json.loads((tmp_path / "a.json").read_text())["verdict"] == "FAIL"

@@ -2,22 +2,14 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import pytest
 
 from calibgraph.child_process import Outcome
 from calibgraph.fleet.files import read_rows
-from calibgraph.fleet.job import Limits, execute
-from calibgraph.fleet.manifest import Job
 from tests.cli.conftest import error_line
 from tests.conftest import Call
-from tests.draws.fleets import write_fleet
-
-
-def run_here(job: Job, limits: Limits, _: str) -> Outcome:
-    with TemporaryDirectory() as folder:
-        return execute(job, limits, Path(folder))
+from tests.draws.fleets import run_here, write_fleet
 
 
 def test_a_manifest_becomes_rows_and_a_page_and_a_second_call_does_nothing(

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from calibgraph import MatcherErrors, Rig, simulate_correspondences
+from calibgraph import MatcherErrors, Rig
+from tests.cli.conftest import words_to_solve
 from tests.conftest import Call
 
 
@@ -25,11 +26,8 @@ def test_perturb_is_repeatable(problem: Path, call: Call) -> None:
 
 
 def test_report_writes_the_same_page_again(pair: Rig, call: Call, tmp_path: Path) -> None:
-    pair.save(tmp_path / "rig.yaml")
-    nonsense = MatcherErrors(outlier_share=1.0)
-    simulate_correspondences(pair, errors=nonsense).save(tmp_path / "table.parquet")
-    out = tmp_path / "out"
-    code, _, err = call("solve", tmp_path / "rig.yaml", tmp_path / "table.parquet", "--out", out)
+    nonsense, out = MatcherErrors(outlier_share=1.0), tmp_path / "out"
+    code, _, err = call(*words_to_solve(tmp_path, pair, errors=nonsense))
     assert code == 1
     assert str(out / "report.html") in err.replace("\n", "")
     page = (out / "report.html").read_text()

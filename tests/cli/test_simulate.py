@@ -8,23 +8,9 @@ import numpy as np
 import pytest
 
 import calibgraph
-from calibgraph import Rig, load_dataset
 from calibgraph.simulation.rigs import rig_of
 from calibgraph.simulation.scenarios import SCENARIOS, draw_scenario
-from tests.conftest import Call, make_camera
-
-
-@pytest.mark.usefixtures("open3d")
-@pytest.mark.slow
-def test_command_writes_a_dataset_and_none_over_it(call: Call, tmp_path: Path) -> None:
-    Rig(cameras={"front": make_camera()}).save(tmp_path / "own.yaml")
-    options = "--rig", tmp_path / "own.yaml", "--frames", 1, "--beams", 16
-    code, _, errors = call("simulate", "street", *options, "--out", tmp_path / "made")
-    assert (code, "rig.yaml: written" in errors) == (0, True)
-    assert len(load_dataset(tmp_path / "made").frames) == 1
-    code, _, errors = call("simulate", "street", *options, "--out", tmp_path / "made")
-    assert code == 2
-    assert "holds files, but no" in errors
+from tests.conftest import Call
 
 
 @pytest.mark.parametrize("name", SCENARIOS)

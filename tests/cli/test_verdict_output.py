@@ -10,12 +10,8 @@ import yaml
 
 import calibgraph
 from calibgraph import MatcherErrors, Rig, simulate_correspondences
+from tests.cli.conftest import words_to_solve
 from tests.conftest import SAMPLE, Call
-
-
-@pytest.fixture
-def truth() -> Rig:
-    return calibgraph.load_rig(SAMPLE / "reference.yaml")
 
 
 @pytest.mark.slow
@@ -36,16 +32,12 @@ def test_a_failure_marks_every_file_and_exits_1(call: Call, tmp_path: Path, trut
 def test_the_error_bar_of_cameras_and_pairs_is_printed(
     call: Call, tmp_path: Path, pair: Rig
 ) -> None:
-    pair.save(tmp_path / "rig.yaml")
-    simulate_correspondences(pair, frames=8, matches=100).save(tmp_path / "table.parquet")
-    (tmp_path / "config.yaml").write_text("bootstrap: 5\n")
-    command = (
-        "solve", tmp_path / "rig.yaml", tmp_path / "table.parquet", "--out", tmp_path / "out",
-        "--config", tmp_path / "config.yaml",
-    )  # fmt: skip
+    (tmp_path / "config.yaml").write_text("seed: 5\n")
+    solve = words_to_solve(tmp_path, pair, frames=8, matches=100)
+    command = (*solve, "--config", tmp_path / "config.yaml")
     code, _, text = call(*command)
     assert code == 0
-    for words in ("left->right", "left (bootstrap)", "Least certain: ", "would help most"):
+    for words in ("left->right", "Least certain: ", "would help most"):
         assert words in text
     assert "more findings: see report.html" in text  # the weakest directions
     code, stdout, _ = call(*command, "--json")
@@ -55,17 +47,14 @@ def test_the_error_bar_of_cameras_and_pairs_is_printed(
     content = yaml.safe_load((tmp_path / "out" / "calibration.yaml").read_text())
     assert "xi = (rotation [rad], translation [m])" in content["covariance_of"]
     assert "in the axes of B" in content["pair_covariance_of"]
-    assert content["config"]["bootstrap"] == 5
+    assert content["config"]["seed"] == 5
 
 
 def test_a_warning_for_lack_of_data_is_told_from_one_that_looks_odd(
     call: Call, tmp_path: Path, pair: Rig
 ) -> None:
     """In the terminal, in JSON, in the file and on the page; the exit code is that of a WARN."""
-    pair.save(tmp_path / "rig.yaml")
-    simulate_correspondences(pair, frames=3, matches=60).save(tmp_path / "few.parquet")
-    out = tmp_path / "out"
-    command = ("solve", tmp_path / "rig.yaml", tmp_path / "few.parquet", "--out", out)
+    command, out = words_to_solve(tmp_path, pair, frames=3, matches=60), tmp_path / "out"
     code, _, text = call(*command)
     assert code == 0
     lines = text.splitlines()
@@ -90,12 +79,8 @@ def test_a_warning_for_lack_of_data_is_told_from_one_that_looks_odd(
 def test_a_fail_shows_three_reasons_and_what_to_do_and_folds_the_rest(
     call: Call, tmp_path: Path, pair: Rig
 ) -> None:
-    pair.save(tmp_path / "rig.yaml")
-    nonsense = simulate_correspondences(pair, errors=MatcherErrors(outlier_share=1.0))
-    nonsense.save(tmp_path / "bad.parquet")
-    code, _, text = call(
-        "solve", tmp_path / "rig.yaml", tmp_path / "bad.parquet", "--out", tmp_path / "out"
-    )
+    nonsense = MatcherErrors(outlier_share=1.0)
+    code, _, text = call(*words_to_solve(tmp_path, pair, errors=nonsense))
     assert code == 1
     before = text[: text.index("Calibration")].splitlines()
     assert before[0].startswith("FAIL: off by more than 0.5 deg or 10 cm with a probability")

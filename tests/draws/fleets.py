@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,9 @@ from pyarrow import csv
 
 from calibgraph import MatcherErrors, perturb, simulate_correspondences
 from calibgraph.arrays import Array
+from calibgraph.child_process import Outcome
+from calibgraph.fleet.job import Limits, execute
+from calibgraph.fleet.manifest import Job
 from calibgraph.model.geometry import relative_transform, retract_all
 from calibgraph.simulation.rigs import rig_of
 
@@ -18,7 +22,6 @@ CAMERAS = ("front", "front_left", "front_right", "left", "rear", "right")
 MODELS = ("compact", "van")
 SPREAD = np.array([np.radians(0.15)] * 3 + [0.004] * 3)
 POOR = 0.3
-MID_YEAR = 182
 
 
 @dataclass(frozen=True)
@@ -30,100 +33,54 @@ class Fleet:
         T_camera_lidar: (n, 4, 4) true.
         moved: (n,) whether the camera was moved.
         poor: (n,) whether its vehicle was poorly observed.
-        changed: (model, batch, camera) whose mount was changed, if any.
     """
 
     rows: pa.Table
     T_camera_lidar: Array
     moved: NDArray[np.bool_]
     poor: NDArray[np.bool_]
-    changed: tuple[str, str, str]
 
 
 def simulate_fleet(
-    rng: np.random.Generator,
-    vehicles: int = 500,
-    *,
-    batches: int = 10,
-    moved_share: float = 0.05,
-    change_deg: float = 0.4,
-    mileage_deg: float = 0.0,
-    step_deg: float = 0.0,
+    rng: np.random.Generator, vehicles: int = 500, *, moved_share: float = 0.05
 ) -> Fleet:
     """A fleet of two models with six cameras each.
 
     Args:
         rng: of all draws.
-        vehicles: in all; batch and model are drawn.
-        batches: per model.
+        vehicles: in all; the model is drawn.
         moved_share: of the cameras: by 1 degree and 2 cm in a random direction.
-        change_deg: of the left camera in the third batch of the first model.
-        mileage_deg: of the rear cameras about x, per 100,000 km.
-        step_deg: of the right cameras of the second model's first batch, from mid 2026 on.
     """
-    plan = _plan(rng, vehicles, batches)
-    model, batch, poor, day, mileage = plan
+    model, poor = rng.integers(2, size=vehicles), rng.random(vehicles) < POOR
     v, c = np.repeat(np.arange(vehicles), 6), np.tile(np.arange(6), vehicles)
     nominal = np.array([_random_pose(rng) for _ in range(12)]).reshape(2, 6, 4, 4)
-    d = _regular(rng, model[v], batch[v], c, change_deg=change_deg)
+    mixing = np.array([_correlation(rng) for _ in CAMERAS])
+    d = np.einsum("nij,nj->ni", mixing[c], rng.normal(size=(len(c), 6)))
     moved = rng.random(len(v)) < moved_share
     d[moved] += _directions(rng, int(np.count_nonzero(moved))) * np.radians(1)
-    rear, right = c == CAMERAS.index("rear"), c == CAMERAS.index("right")
-    d[rear, 0] += np.radians(mileage_deg) * mileage[v[rear]] / 1e5
-    late = right & (model[v] == 1) & (batch[v] == 0) & (day[v] > MID_YEAR)
-    d[late, 1] += np.radians(step_deg)
     truth = retract_all(nominal[model[v], c], -d)
     covariance = _noise(rng, poor[v])
     errors = np.einsum("nij,nj->ni", np.linalg.cholesky(covariance), rng.normal(size=d.shape))
-    temperature = rng.uniform(-10, 35, vehicles)
-    rows = _table(plan, temperature, retract_all(truth, -errors), covariance)
-    changed = (MODELS[0], "B02", CAMERAS[3]) if change_deg > 0 else ("", "", "")
-    return Fleet(rows, truth, moved, poor[v], changed)
+    rows = _table((model[v], poor[v], rng.uniform(0, 365, vehicles)[v]),
+                  retract_all(truth, -errors), covariance)  # fmt: skip
+    return Fleet(rows, truth, moved, poor[v])
 
 
-def _plan(rng: np.random.Generator, vehicles: int, batches: int) -> tuple[NDArray[Any], ...]:
-    """Of each vehicle: model, batch, whether it is poorly observed, day of the year, mileage."""
-    model, batch = rng.integers(2, size=vehicles), rng.integers(batches, size=vehicles)
-    poor, day = rng.random(vehicles) < POOR, rng.uniform(0, 365, vehicles)
-    return model, batch, poor, day, rng.uniform(0, 150_000, vehicles)
-
-
-def _regular(
-    rng: np.random.Generator,
-    model: NDArray[Any],
-    batch: NDArray[Any],
-    camera: NDArray[Any],
-    *,
-    change_deg: float,
-) -> Array:
-    """(n, 6) deviations of vehicles and batches, and of the mount that was changed."""
-    mixing = np.array([_correlation(rng) for _ in CAMERAS])
-    shift = rng.normal(size=(2, batch.max() + 3, 6, 6)) * SPREAD * 0.2
-    shift[0, 2, 3] += _directions(rng, 1)[0] * np.radians(change_deg)
-    d = np.einsum("nij,nj->ni", mixing[camera], rng.normal(size=(len(camera), 6)))
-    return np.asarray(d + shift[model, batch, camera])
-
-
-def _table(
-    plan: tuple[NDArray[Any], ...], temperature: Array, T_camera_lidar: Array, covariance: Array
-) -> pa.Table:
-    """The rows, six cameras to a vehicle."""
-    model, batch, poor, day, mileage = (np.repeat(values, 6) for values in plan)
-    vehicle = np.repeat(np.arange(len(temperature)), 6)
+def _table(plan: tuple[NDArray[Any], ...], T_camera_lidar: Array, covariance: Array) -> pa.Table:
+    """The rows, six cameras to a vehicle, by its model, whether it is poor, and the day."""
+    model, poor, day = plan
+    vehicle = np.arange(len(model)) // 6
     start = np.datetime64("2026-01-01T00:00:00", "us")
     return pa.table({
         "vehicle": [f"V{i:06d}" for i in vehicle],
-        "camera": [*CAMERAS] * len(temperature),
+        "camera": [*CAMERAS] * (len(model) // 6),
         "model": [MODELS[i] for i in model],
-        "batch": [f"B{i:02d}" for i in batch],
         "status": ["done"] * len(vehicle),
         "verdict": np.where(poor, "WARN", "PASS").tolist(),
         "reasons": [["few frames"] if p else [] for p in poor],
         "T_camera_lidar": _lists(T_camera_lidar, 16),
         "covariance": _lists(covariance, 36),
         "date": start + (day * 86_400e6).astype("timedelta64[us]"),
-        "mileage_km": mileage,
-        "temperature_c": np.repeat(temperature, 6),
     })  # fmt: skip
 
 
@@ -198,3 +155,9 @@ def write_fleet(folder: Path, vehicles: int, *, frames: int = 6, matches: int = 
     }
     csv.write_csv(pa.table(columns), folder / "fleet.csv")
     return folder / "fleet.csv"
+
+
+def run_here(job: Job, limits: Limits, _: str) -> Outcome:
+    """Run a job in this process, in place of ``run_job``."""
+    with TemporaryDirectory() as folder:
+        return execute(job, limits, Path(folder))

@@ -104,7 +104,7 @@ def align(truth: Rig, table: Correspondences, true_points_m: Array) -> dict[str,
     for number, (name, camera) in enumerate(truth.cameras.items()):
         rows, T = table.camera_index == number, camera.T_camera_lidar
         pixels, _ = camera.lens.project(true_points_m[rows] @ T[:3, :3].T + T[:3, 3])
-        block = ProjectionBlock(camera.lens, table.points_lidar_m[rows], pixels, loss="l2")
+        block = ProjectionBlock(camera.lens, table.points_lidar_m[rows], pixels, scale=np.inf)
         graph = gtsam.NonlinearFactorGraph()
         graph.add(block_factor(pose_key((name,), name), block))
         found |= optimize(graph, (name,), {name: T}).T_camera_lidar

@@ -43,13 +43,7 @@ def world(lens: Lens, count: int, seed: int = 0, *, outliers: float = 0.2) -> Pr
     )
     roots[::5, 2] = 0.0
     in_lidar = points @ TRUTH.rotation().matrix().T + TRUTH.translation()
-    return ProjectionBlock(lens, in_lidar, pixels, roots)
-
-
-def with_loss(block: ProjectionBlock, loss: str, scale: float = 3.0) -> ProjectionBlock:
-    return ProjectionBlock(
-        block.lens, block.points_lidar_m, block.pixels_px, block.sqrt_information, loss, scale
-    )
+    return ProjectionBlock(lens, in_lidar, pixels, roots, scale=3.0)
 
 
 def at(pose: gtsam.Pose3) -> gtsam.Values:

@@ -30,11 +30,11 @@ def twice(x):
     return {factor} * x
 """
 CALL = "from kernels.main import kernel\nprint(kernel(3.0), sum(kernel.stats.cache_hits.values()))"
-LOSS = (
-    "import numpy as np; from factors.loss import loss_and_weight as kernel\n"
-    "print(kernel(1, 2.0, 9.0), sum(kernel.stats.cache_hits.values()))"
+ROOT = (
+    "import numpy as np; from factors.conditioning import fill_root as kernel\n"
+    "found = kernel(np.eye(6), np.ones(6), 9.0, np.empty(7), np.zeros((6, 7)))\n"
+    "print(found, sum(kernel.stats.cache_hits.values()))"
 )
-HUBER = "(8.0, 0.6666666666666666)"  # 2 k r - k^2 and k / r at r = 3, k = 2
 NOT_KEPT = "calibgraph: compiled code is not kept ("
 
 # Root may write anywhere; without its capabilities it is held to the permissions like others.
@@ -72,13 +72,13 @@ def read_only(tmp_path: Path) -> Path:
 def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What a first process keeps, in folders that were not there."""
     cache = tmp_path_factory.mktemp("kept") / "above" / "cache"
-    assert run(LOSS, NUMBA_CACHE_DIR=str(cache)) == (f"{HUBER} 0", "")
+    assert run(ROOT, NUMBA_CACHE_DIR=str(cache)) == ("True 0", "")
     return cache
 
 
 def test_a_second_process_does_not_compile_again(kept: Path) -> None:
     """The folders are made for the user alone."""
-    assert run(LOSS, NUMBA_CACHE_DIR=str(kept)) == (f"{HUBER} 1", "")
+    assert run(ROOT, NUMBA_CACHE_DIR=str(kept)) == ("True 1", "")
     made = kept.parent, kept, *kept.iterdir()
     assert {each.stat().st_mode & 0o777 for each in made} == {0o700}
 
@@ -93,10 +93,10 @@ def test_with_a_read_only_folder_kernels_are_compiled_in_memory_and_one_line_rep
     packages = tmp_path / "packages"
     shutil.copytree("factors", packages / "factors", ignore=shutil.ignore_patterns("__pycache__"))
     (packages / "factors").chmod(0o555)
-    two = LOSS + "\nfrom factors.conditioning import fill_root as other"
-    two += "; print(other(np.eye(6), np.ones(6), 9.0, np.empty(7), np.zeros((6, 7))))"
+    two = ROOT + "\nfrom factors import Lens; lens = Lens.pinhole(fx=1, fy=1, cx=0, cy=0)"
+    two += "; print(lens.project([[0.0, 0.0, 2.0]])[1][0])"
     out, err = run(two, path=packages, **{variable: str(read_only)})
-    assert out.splitlines() == [f"{HUBER} 0", "True"]
+    assert out.splitlines() == ["True 0", "True"]
     assert err.startswith(NOT_KEPT) and err.count("\n") == 1
     assert "Permission denied" in err and "set NUMBA_CACHE_DIR" in err
     assert [*read_only.iterdir()] == []
@@ -108,18 +108,18 @@ BY_ANOTHER = "import os; os.geteuid = lambda: 4242\n"
 @pytest.mark.parametrize(
     ("spoil", "code", "why"),
     [
-        (lambda index: index.parents[1].chmod(0o777), LOSS, ": others may write it"),
+        (lambda index: index.parents[1].chmod(0o777), ROOT, ": others may write it"),
         pytest.param(
             lambda index: index.parents[2].chmod(0o777),
-            LOSS,
+            ROOT,
             ": others may write it",
             marks=pytest.mark.slow,
         ),
         pytest.param(
-            lambda index: index.chmod(0o666), LOSS, ": others may write it", marks=pytest.mark.slow
+            lambda index: index.chmod(0o666), ROOT, ": others may write it", marks=pytest.mark.slow
         ),
-        (lambda index: index.symlink_to(index.rename(index.with_name("x"))), LOSS, ": others may"),
-        (lambda index: None, BY_ANOTHER + LOSS, ": belongs to another user)"),
+        (lambda index: index.symlink_to(index.rename(index.with_name("x"))), ROOT, ": others may"),
+        (lambda index: None, BY_ANOTHER + ROOT, ": belongs to another user)"),
     ],  # fmt: skip
     ids=["folder", "folder above", "file", "link", "another user's"],
 )
@@ -129,11 +129,11 @@ def test_code_that_another_user_may_have_written_is_not_loaded(
     """numba's index is a pickle: this one would make a file."""
     cache, made = tmp_path / "above" / "cache", tmp_path / "made"
     shutil.copytree(kept.parent, cache.parent)
-    (index,) = cache.rglob("*loss_and_weight*.nbi")
+    (index,) = cache.rglob("*fill_root*.nbi")
     index.write_bytes(b"cbuiltins\nopen\n(V%b\nVw\ntR." % bytes(made))
     spoil(index)
     out, err = run(code, NUMBA_CACHE_DIR=str(cache))
-    assert out == f"{HUBER} 0" and not made.exists()
+    assert out == "True 0" and not made.exists()
     assert err.startswith(NOT_KEPT) and err.count("\n") == 1 and why in err
 
 

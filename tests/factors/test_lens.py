@@ -179,7 +179,7 @@ def test_residuals_cross_the_seam_of_a_panorama_the_short_way() -> None:
     assert valid.all()
     values = gtsam.Values()
     values.insert(0, gtsam.Pose3())
-    one = projection_factor(0, PANORAMA, point[0], pixel[0], loss="cauchy", scale=4.0)
+    one = projection_factor(0, PANORAMA, point[0], pixel[0], scale=4.0)
     assert block_factor(0, block).error(values) == pytest.approx(one.error(values), rel=1e-12)
     assert one.error(values) < 4.0
 

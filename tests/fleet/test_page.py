@@ -28,7 +28,7 @@ def column(rows: pa.Table, name: str, values: object) -> pa.Table:
 @pytest.fixture(scope="module")
 def rows() -> pa.Table:
     """Vehicle 0 failed, vehicle 1 has FAIL; nothing else but 5 % of cameras moved."""
-    table = simulate_fleet(np.random.default_rng(7), 120, change_deg=0.0).rows
+    table = simulate_fleet(np.random.default_rng(7), 120).rows
     verdict, status = table["verdict"].to_pylist(), table["status"].to_pylist()
     status[:6], verdict[6:12] = ["failed"] * 6, ["FAIL"] * 6
     return column(column(table, "status", status), "verdict", verdict)
@@ -109,7 +109,7 @@ def test_the_page_of_ten_thousand_vehicles_is_small(tmp_path: Path) -> None:
 def test_the_model_is_written_beside_the_page(page: Path) -> None:
     known = json.loads((page.parent / "fleet_model.json").read_text())
     (mount,) = {n: m for n, m in known["models"]["van"]["cameras"].items() if n == "left"}.values()
-    spread = np.sqrt(np.diag(mount["spread_within_a_batch"]))
+    spread = np.sqrt(np.diag(mount["spread"]))
     assert np.abs(spread / SPREAD - 1).max() < 0.5  # of about 55 vehicles: five sigma
     estimates = parquet.read_table(page.parent / "estimates.parquet")
     assert len(estimates) == 720

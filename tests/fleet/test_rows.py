@@ -26,7 +26,7 @@ from calibgraph.fleet.files import (
     read_bytes,
     read_rows,
 )
-from calibgraph.fleet.run import run_fleet
+from calibgraph.fleet.run import run_fleet, thread_executor
 from tests.draws.fleets import write_fleet
 
 
@@ -135,7 +135,8 @@ def test_tables_in_an_archive_are_fetched_solved_and_removed(
     (tmp_path / "scratch").mkdir()
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "scratch"))
     out = str(tmp_path / "out")
-    summary = run_fleet(str(tmp_path / "fleet.csv"), out)
+    with thread_executor(1) as executor:
+        summary = run_fleet(str(tmp_path / "fleet.csv"), out, executor=executor)
     assert summary.failures == {"bad input": 1}
     (error,) = [row["error"] for row in read_rows(out).to_pylist() if row["error"]]
     assert f"zip://none.parquet::{archive}" in error

@@ -11,7 +11,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +20,13 @@ import psutil
 import pytest
 
 from calibgraph import load_correspondences, load_rig, solve
+from calibgraph.child_process import Outcome
 from calibgraph.errors import CalibrationError, FileError
 from calibgraph.fleet.files import Store, read_rows
 from calibgraph.fleet.job import Limits, release, run_job
-from calibgraph.fleet.manifest import load_manifest
+from calibgraph.fleet.manifest import Job, load_manifest
 from calibgraph.fleet.run import Summary, dask_executor, run_fleet, thread_executor
-from tests.draws.fleets import write_fleet
+from tests.draws.fleets import run_here, write_fleet
 
 POISON = Path(__file__).parent / "poison"
 GOOD = ("car-00000", "car-00001", "car-00002")
@@ -37,7 +38,13 @@ ILL = {
     "broken": "bad input",
 }
 # 3 GB: a child's libraries reserve under 1 GB, the hungry one takes 8 GB.
-LIMITS = Limits(timeout_s=20.0, memory_bytes=3 * 10**9)  # a good job takes 1 s on an idle machine
+LIMITS = Limits(timeout_s=60.0, memory_bytes=3 * 10**9)  # a good job takes 1 s on an idle machine
+
+
+def run_impatiently(job: Job, limits: Limits, of_release: str) -> Outcome:
+    """Run a job; the endless one, which would be waited for, has 3 s."""
+    seconds = 3.0 if job.vehicle == "endless" else limits.timeout_s
+    return run_job(job, replace(limits, timeout_s=seconds), of_release)
 
 
 @contextmanager
@@ -83,7 +90,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def alone(folder: Path) -> dict[tuple[str, str], dict[str, Any]]:
     """The rows of the good vehicles when nothing befalls the others."""
-    run_fleet(str(folder / "fleet.csv"), str(folder / "alone"), limits=LIMITS)
+    with thread_executor(1) as executor:
+        run_fleet(
+            str(folder / "fleet.csv"), str(folder / "alone"), executor=executor, limits=LIMITS
+        )
     return rows_of(str(folder / "alone"))
 
 
@@ -105,6 +115,8 @@ def run(request: pytest.FixtureRequest, folder: Path) -> Run:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", str(POISON), prepend=":")
         patch.chdir(here.parent)
+        if request.param == "threads":  # processes of Dask do not know this module
+            patch.setattr("calibgraph.fleet.run.run_job", run_impatiently)
         with executor_of(request.param) as executor:
             summary = run_fleet(manifest, out, executor=executor, limits=LIMITS)
     return Run(request.param, manifest, out, summary)
@@ -166,7 +178,10 @@ def test_rows_and_workers_of_another_version_are_refused(
         run_fleet(manifest, str(folder / "alone"))
 
 
-def test_missing_recordings_become_rows_that_are_tried_again(tmp_path: Path) -> None:
+def test_missing_recordings_become_rows_that_are_tried_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("calibgraph.fleet.run.run_job", run_here)
     manifest, out = tmp_path / "fleet.csv", str(tmp_path / "out")
     manifest.write_text("vehicle,recording\na,none\nb,neither\n")
     for _ in range(2):

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import errno
+from copy import deepcopy
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -11,14 +13,16 @@ import pytest
 import yaml
 
 from calibgraph import FileError, load_calibration, load_correspondences, load_rig
-from calibgraph.io.calibrations import error_bars
+from calibgraph.io.calibrations import stated_result
 from calibgraph.report.html import write_result
 from tests.conftest import CommandRun
+
+pytestmark = pytest.mark.usefixtures("blank_diagrams")
 
 WRONG: dict[str, Any] = {
     "covariance": {"left": [[1.0]]},
     "joint_covariance": [[1.0]],
-    "bootstrap_covariance": {"left": [[float("nan")] * 6] * 6},
+    "pair_covariance": {"left->right": [[float("nan")] * 6] * 6},
     "stage1_T_camera_lidar": {"left": [[1.0]]},
     "camera_verdicts": {},
     "residuals": {"left": {"median_px": "large"}},
@@ -157,11 +161,15 @@ def test_a_result_of_much_metadata_is_replaced_but_no_table_of_others(
     assert load_correspondences(path).metadata == long.metadata
 
 
+@cache
+def read_once(path: Path) -> dict[str, Any]:
+    content: dict[str, Any] = yaml.load(path.read_text(), Loader=yaml.CSafeLoader)
+    return content
+
+
 def content_of(result: CommandRun) -> dict[str, Any]:
     """The sample's result, as its file holds it."""
-    text = (result.folder / "calibration.yaml").read_text()
-    content: dict[str, Any] = yaml.load(text, Loader=yaml.CSafeLoader)
-    return content
+    return deepcopy(read_once(result.folder / "calibration.yaml"))
 
 
 def edited(change: dict[str, Any], result: CommandRun, folder: Path) -> Path:
@@ -182,7 +190,7 @@ def test_a_covariance_that_is_none_is_refused(
     covariance = content_of(calibrated_sample)["covariance"]
     covariance["left"][place[0]][place[1]] = value
     path = edited({"covariance": covariance}, calibrated_sample, tmp_path)
-    for read in (load_calibration, error_bars):
+    for read in (load_calibration, stated_result):
         with pytest.raises(FileError, match=f"covariance.left: .*{words}"):
             read(path)
 
@@ -201,11 +209,16 @@ def test_whether_an_error_bar_holds_is_true_or_false(
 ) -> None:
     path = edited({"error_bar_holds": {"left": "yes"}}, calibrated_sample, tmp_path)
     with pytest.raises(FileError, match="error_bar_holds.left"):
-        error_bars(path)
+        stated_result(path)
 
 
-def test_unknown_settings_are_refused(calibrated_sample: CommandRun, tmp_path: Path) -> None:
+def test_unknown_settings_are_refused_and_former_ones_that_changed_nothing_are_not(
+    calibrated_sample: CommandRun, tmp_path: Path
+) -> None:
     settings = content_of(calibrated_sample)["config"]
-    file = edited({"config": {**settings, "aggregate": "mean"}}, calibrated_sample, tmp_path)
-    with pytest.raises(FileError, match="unknown key 'aggregate'"):
-        load_calibration(file)
+    for key, value in (("aggregate", "mean"), ("loss", "huber")):
+        file = edited({"config": {**settings, key: value}}, calibrated_sample, tmp_path)
+        with pytest.raises(FileError, match=f"unknown key '{key}'"):
+            load_calibration(file)
+    file = edited({"config": {**settings, "loss": "cauchy"}}, calibrated_sample, tmp_path)
+    assert load_calibration(file).config == load_calibration(calibrated_sample.folder).config

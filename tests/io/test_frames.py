@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import shutil
 import struct
 import zlib
 from pathlib import Path
@@ -28,24 +27,6 @@ from calibgraph.pipeline import hash_inputs
 from tests.conftest import SAMPLE, make_camera
 
 
-def test_truncated_and_wrong_images_are_named(tmp_path: Path) -> None:
-    camera = load_rig(SAMPLE).cameras["left"]
-    jpg = Path(shutil.copy(SAMPLE / "cameras" / "left" / "000000.jpg", tmp_path))
-    image = cv2.imread(str(jpg))
-    png = tmp_path / "image.png"
-    cv2.imwrite(str(png), image)
-    np.testing.assert_array_equal(load_image(png, camera), image)
-    for path in (jpg, png):
-        data = path.read_bytes()
-        for part in (data[: len(data) // 2], data[:-5], b"", b"no image at all"):
-            path.write_bytes(part)
-            with pytest.raises(FileError, match=path.name):
-                load_image(path, camera)
-    cv2.imwrite(str(png), image[:, :-2])
-    with pytest.raises(FileError, match=r"is 638x360 px, the rig says 640x360 px"):
-        load_image(png, camera)
-
-
 def png(width_px: int, height_px: int, pixels: bytes) -> bytes:
     """A PNG with this header, whatever its pixels are."""
 
@@ -58,39 +39,52 @@ def png(width_px: int, height_px: int, pixels: bytes) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
 
 
-@pytest.mark.parametrize("side_px", [28_000, 10**6, 2**31 - 1])
-def test_a_size_is_compared_before_memory_is_taken_for_it(side_px: int, tmp_path: Path) -> None:
-    path = tmp_path / "bomb.png"
-    path.write_bytes(png(side_px, side_px, bytes(1000)))
-    with pytest.raises(FileError, match=f"is {side_px}x{side_px} px, the rig says 1240x376 px"):
-        load_image(path, make_camera())
+LEFT = load_rig(SAMPLE).cameras["left"]
+JPG = (SAMPLE / "cameras" / "left" / "000000.jpg").read_bytes()
+BGR = np.asarray(cv2.imdecode(np.frombuffer(JPG, np.uint8), cv2.IMREAD_COLOR))
+MIDDLE = len(JPG) // 2
 
 
-def sample_jpeg() -> bytes:
-    return (SAMPLE / "cameras" / "left" / "000000.jpg").read_bytes()
+def coded(image: np.ndarray, suffix: str = ".png", *options: int) -> bytes:
+    return cv2.imencode(suffix, image, options)[1].tobytes()
 
 
-def damaged_images() -> dict[str, bytes]:
-    """Images whose first and last bytes are right."""
-    jpg, camera = sample_jpeg(), load_rig(SAMPLE).cameras["left"]
-    middle = len(jpg) // 2
-    image = cv2.imencode(".png", cv2.imdecode(np.frombuffer(jpg, np.uint8), cv2.IMREAD_COLOR))[1]
-    flipped = bytearray(image.tobytes())
-    flipped[len(flipped) // 2] ^= 255
-    return {
-        "half.jpg": jpg[:middle] + b"\xff\xd9",
-        "gap.jpg": jpg[:middle] + jpg[middle + 500 :],
-        "flipped.png": bytes(flipped),
-        "short.png": png(camera.width_px, camera.height_px, bytes(1000)),
-    }
+PNG = coded(BGR)
+DARK, FLAT = np.full((LEFT.height_px, LEFT.width_px), 200, np.uint16), np.zeros((6000,) * 2, "u1")
+NOT_LEFT = [
+    *((name, part, name) for name, data in (("image.jpg", JPG), ("image.png", PNG))
+      for part in (data[: len(data) // 2], data[:-5], b"", b"no image at all")),
+    # the first and last bytes of these are right
+    ("half.jpg", JPG[:MIDDLE] + b"\xff\xd9", "half.jpg: is damaged"),
+    ("gap.jpg", JPG[:MIDDLE] + JPG[MIDDLE + 500 :], "gap.jpg: is damaged"),
+    ("flipped.png", PNG[: len(PNG) // 2] + bytes(1) + PNG[len(PNG) // 2 + 1 :], "is damaged"),
+    ("short.png", png(LEFT.width_px, LEFT.height_px, bytes(1000)), "short.png: is damaged"),
+    ("narrow.png", coded(BGR[:, :-2]), "is 638x360 px, the rig says 640x360 px"),
+    *(("bomb.png", png(side, side, bytes(1000)), f"is {side}x{side} px, the rig says 640x360 px")
+      for side in (28_000, 10**6, 2**31 - 1)),  # compared before memory is taken
+    ("dark.png", coded(DARK), "16 bits and uses only the lower 8"),
+]  # fmt: skip
 
 
-@pytest.mark.parametrize("name", damaged_images())
-def test_a_damaged_image_is_not_filled_up(name: str, tmp_path: Path) -> None:
-    path = tmp_path / name
-    path.write_bytes(damaged_images()[name])
-    with pytest.raises(FileError, match=f"{name}: is damaged"):
-        load_image(path, load_rig(SAMPLE).cameras["left"])
+@pytest.mark.parametrize(("name", "data", "said"), NOT_LEFT, ids=range(len(NOT_LEFT)))
+def test_what_is_no_image_of_the_camera_is_named_and_not_filled_up(
+    name: str, data: bytes, said: str, tmp_path: Path
+) -> None:
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(FileError, match=said):
+        load_image(tmp_path / name, LEFT)
+    (tmp_path / "whole.png").write_bytes(PNG)
+    np.testing.assert_array_equal(load_image(tmp_path / "whole.png", LEFT), BGR)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+def test_an_image_that_states_more_pixels_than_its_bytes_hold_is_refused(
+    suffix: str, tmp_path: Path
+) -> None:
+    path, size = tmp_path / f"image{suffix}", {"width_px": 6000, "height_px": 6000}
+    path.write_bytes(coded(FLAT, suffix, cv2.IMWRITE_JPEG_QUALITY, 5))
+    with pytest.raises(FileError, match=r"it states 6000x6000 px in \d+ kB: no picture packs so"):
+        load_image(path, LEFT.model_copy(update=size))
 
 
 @pytest.mark.parametrize("suffix", ["jpg", "png"])
@@ -100,21 +94,12 @@ def test_an_image_that_programs_turn_differently_is_refused(
 ) -> None:
     exif, path = Image.Exif(), tmp_path / f"turned.{suffix}"
     exif[Base.Orientation] = orientation
-    Image.open(io.BytesIO(sample_jpeg())).save(path, exif=exif)
-    camera = load_rig(SAMPLE).cameras["left"]
+    Image.open(io.BytesIO(JPG)).save(path, exif=exif)
     if orientation == 1:
-        assert load_image(path, camera).any()
+        assert load_image(path, LEFT).any()
     else:
         with pytest.raises(FileError, match=f"has the EXIF orientation {orientation}"):
-            load_image(path, camera)
-
-
-def test_an_image_that_16_bits_make_black_is_named(tmp_path: Path) -> None:
-    camera = make_camera()
-    path = tmp_path / "dark.png"
-    cv2.imwrite(str(path), np.full((camera.height_px, camera.width_px), 200, np.uint16))
-    with pytest.raises(FileError, match="16 bits and uses only the lower 8"):
-        load_image(path, camera)
+            load_image(path, LEFT)
 
 
 def test_profiles_in_a_png_print_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
@@ -125,18 +110,6 @@ def test_profiles_in_a_png_print_nothing(tmp_path: Path, capfd: pytest.CaptureFi
     image.save(tmp_path / "bad.png", icc_profile=b"no profile" * 20)
     np.testing.assert_array_equal(load_image(tmp_path / "bad.png", camera), pixels[:, :, ::-1])
     assert capfd.readouterr().err == ""
-
-
-@pytest.mark.parametrize("suffix", [".png", ".jpg"])
-def test_an_image_that_states_more_pixels_than_its_bytes_hold_is_refused(
-    suffix: str, tmp_path: Path
-) -> None:
-    side = 6000
-    path, size = tmp_path / f"image{suffix}", {"width_px": side, "height_px": side}
-    camera = make_camera().model_copy(update=size)
-    cv2.imwrite(str(path), np.zeros((side, side), np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 5])
-    with pytest.raises(FileError, match=r"it states 6000x6000 px in \d+ kB: no picture packs so"):
-        load_image(path, camera)
 
 
 SMALL = make_camera().model_copy(update={"width_px": 8, "height_px": 6})
@@ -282,16 +255,6 @@ def test_kept_frames_share_one_cache_of_windows() -> None:
     assert cache_of(kept.frames, own) is cache_of(kept.frames[2:], own) is not own
     assert cache_of(data.frames, own) is own
     assert cache_of(keep_frames(data).frames, own) is not cache_of(kept.frames, own)
-
-
-def test_no_size_drops_the_cache_of_windows(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(kept_frames, "MAX_BYTES", 1)
-    data = keep_frames(calibgraph.load_dataset(SAMPLE))
-    cache, camera = cache_of(data.frames, FrameCache()), data.rig.cameras["left"]
-    images = [cache.image(frame, "left", camera) for frame in data.frames]
-    assert cache_of(data.frames, FrameCache()) is cache
-    for frame, image in zip(data.frames, images, strict=True):
-        assert cache.image(frame, "left", camera) is image
 
 
 def test_what_was_used_last_is_kept_up_to_a_size(monkeypatch: pytest.MonkeyPatch) -> None:

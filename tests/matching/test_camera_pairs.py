@@ -19,7 +19,6 @@ from calibgraph.matching.camera_pairs.geometry import (
     planes_at,
 )
 from calibgraph.model.camera_matches import CameraMatches
-from calibgraph.model.config import Config
 from calibgraph.model.geometry import inverse_ranges, invert, planes_in_lidar
 from calibgraph.simulation.rigs import rig_of
 from calibgraph.solver.pair_refinement import fit_pair
@@ -31,11 +30,6 @@ from tests.conftest import FORWARD, SAMPLE, make_camera
 @pytest.fixture(scope="module")
 def data() -> Dataset:
     return calibgraph.load_dataset(SAMPLE).select("0:3")
-
-
-@pytest.fixture(scope="module")
-def truth() -> Rig:
-    return calibgraph.load_rig(SAMPLE / "reference.yaml")
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +50,7 @@ def test_matches_are_right_where_the_lidar_knows(
 
     Features are good to 0.6 px per axis; about a tenth are wrong along their epipolar line.
     """
-    terms = pair_terms(truth, with_surfaces(found, data, truth), Config())
+    terms = pair_terms(truth, with_surfaces(found, data, truth))
     assert [(term.a, term.b) for term in terms[:2]] == [
         ("front_left", "front_right"), ("front_right", "front_left"),
     ]  # fmt: skip
@@ -104,7 +98,7 @@ def test_kitti_pairs_are_found_from_a_displaced_first_camera(realdata: Path, seq
     held = np.diag(pose_sigmas(rotation_rad=0.015, translation_m=0.17) ** 2)
     pair = ("image_2", "image_3")
     for _ in range(3):
-        terms = pair_terms(rig, with_surfaces(matches, data, rig), Config())
+        terms = pair_terms(rig, with_surfaces(matches, data, rig))
         rig = start.moved_to(fit_pair(pair, terms, start.T_camera_lidar, held)[0])
     error = calibgraph.evaluate(rig, reference).pairs["image_2->image_3"]
     assert error.rotation_error_deg < 0.08

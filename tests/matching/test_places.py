@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -55,19 +56,27 @@ STOPS = [_pose(9.0 * number) for number in range(6)]
 """(4, 4) T_world_lidar of a vehicle that drives along the street."""
 
 
-def scan_at(T_world_lidar: Array, seed: int) -> NDArray[np.float32]:
-    """(n, 3) the points that a LiDAR of 32 beams sees up to 80 m, with 2 cm of noise."""
-    rays = _RAYS.reshape(-1, 3)
-    direction, origin = rays @ T_world_lidar[:3, :3].T, T_world_lidar[:3, 3]
+@cache
+def _ranges_m(pose: bytes) -> Array:
+    """(n,) what a LiDAR of 32 beams measures, without noise, at (4, 4) T_world_lidar."""
+    T_world_lidar = np.frombuffer(pose).reshape(4, 4)
+    direction, origin = _RAYS.reshape(-1, 3) @ T_world_lidar[:3, :3].T, T_world_lidar[:3, 3]
     with np.errstate(divide="ignore"):
         range_m = np.where(direction[:, 2] < 0, -origin[2] / direction[:, 2], np.inf)
         inverse = 1.0 / direction
     for box in _BOXES:  # a ray is inside between its last entry and its first exit of three slabs
-        at = np.sort((box[:, None] - origin) * inverse, axis=0)
-        enters, leaves = at[0].max(axis=1), at[1].min(axis=1)
+        one, other = (box[:, None] - origin) * inverse
+        enters = np.minimum(one, other).max(axis=1)
+        leaves = np.maximum(one, other).min(axis=1)
         hit = (enters > 0) & (enters < np.minimum(leaves, range_m))
         range_m[hit] = enters[hit]
-    range_m += np.random.default_rng(seed).normal(0, 0.02, len(range_m))
+    return np.asarray(range_m)
+
+
+def scan_at(T_world_lidar: Array, seed: int) -> NDArray[np.float32]:
+    """(n, 3) the points that it sees up to 80 m, with 2 cm of noise."""
+    rays, range_m = _RAYS.reshape(-1, 3), _ranges_m(T_world_lidar.tobytes())
+    range_m = range_m + np.random.default_rng(seed).normal(0, 0.02, len(range_m))
     seen = range_m < 80
     return (rays[seen] * range_m[seen, None]).astype(np.float32)
 
@@ -180,7 +189,13 @@ def test_unlike_clouds_are_of_other_places_if_they_show_enough(
     assert find_places(data, data.rig, name) == [[0, 1, 2, 3], [4, 5]]
 
 
-@pytest.mark.parametrize("axes", [("y", 180.0), ("x", 90.0), ("y", 45.0)])
+@pytest.mark.parametrize(
+    "axes",
+    [
+        ("y", 45.0),
+        *(pytest.param(axes, marks=pytest.mark.slow) for axes in (("y", 180), ("x", 90))),
+    ],
+)
 def test_the_places_do_not_depend_on_the_axes_of_the_clouds(
     axes: tuple[str, float], tmp_path: Path
 ) -> None:

@@ -71,11 +71,6 @@ def simulate(dataset: Dataset, rig: Rig) -> Correspondences:
 
 
 @pytest.fixture(scope="module")
-def truth() -> Rig:
-    return calibgraph.load_rig(SAMPLE / "reference.yaml")
-
-
-@pytest.fixture(scope="module")
 def guess(truth: Rig) -> Rig:
     return calibgraph.perturb(truth, rotation_deg=3.0, translation_m=0.3, seed=0)
 

@@ -31,7 +31,7 @@ CAMERA = "front_left"
 @pytest.fixture
 def server(tmp_path: Path) -> Iterator[PickServer]:
     with PickServer(Workspace(load_dataset(SAMPLE), tmp_path), 0) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
+        threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
         yield server
         server.shutdown()
 

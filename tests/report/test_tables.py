@@ -14,7 +14,7 @@ from rich.table import Table
 
 import calibgraph
 from calibgraph import Rig, simulate_correspondences
-from calibgraph.audit import Audit, CameraAudit, Drift, Trend
+from calibgraph.audit import Audit, CameraAudit, Drift
 from calibgraph.audit import page as audit_tables
 from calibgraph.model.calibration import Calibration, Residuals
 from calibgraph.model.lens import LensEstimate
@@ -42,7 +42,6 @@ def extreme() -> Calibration:
         initial_rig=far,
         camera_verdicts=dict.fromkeys(NAMES, Verdict((), ErrorProbability(0.001, 0.98))),
         covariance=dict.fromkeys(NAMES, COVARIANCE),
-        bootstrap=dict.fromkeys(NAMES, COVARIANCE),
         residuals=dict.fromkeys(NAMES, Residuals(12345.678, 1.0, 1.0, 1.0, 1.0)),
         counts=dict.fromkeys(NAMES, {"used": 12_345_678, "frames_used": 100_000}),
         prior_share=dict.fromkeys(NAMES, 1.0),
@@ -97,10 +96,8 @@ def audit(extreme: Calibration) -> Audit:
 def drift() -> Drift:
     """Of two results with long names."""
     one = CameraAudit("CANNOT TELL", "a reason", TWIST.copy(), -TWIST, -TWIST)
-    trend = Trend(True, "a reason", TWIST.copy(), -TWIST, "result")
     results = ("recordings/2026-03-01_monday_morning", "recordings/2026-03-02_tuesday")
-    return Drift(results, dict.fromkeys(NAMES, (one, one)),
-                 dict.fromkeys(NAMES, trend), (None, None), 0.5, 10.0, 0.01)  # fmt: skip
+    return Drift(results, dict.fromkeys(NAMES, (one, one)), (None, None), 0.5, 10.0, 0.01)
 
 
 TABLES: dict[str, Callable[[Calibration], Table]] = {

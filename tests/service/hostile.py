@@ -7,7 +7,6 @@ import json
 import pickle
 import struct
 import zipfile
-import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
@@ -16,6 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from tests.conftest import SAMPLE
+from tests.io.test_frames import png
 
 _CAMERA = "front_left"
 _HUGE_PX = 60_000
@@ -23,23 +23,14 @@ _HUGE_PX = 60_000
 
 @dataclass(frozen=True)
 class Hostile:
-    """An upload: its parts in place of those of a good one.
-
-    Attributes:
-        name: of the attack.
-        kind: path of the route.
-        files: contents by the name of the field.
-        fields: texts by the name of the field.
-        names: of files, as the sender gives them.
-        is_harmless: whether the job does what was asked for.
-    """
+    """An upload to the route ``kind``, with files, fields and names of files that want to harm."""
 
     name: str
     kind: str
     files: Mapping[str, bytes] = field(default_factory=dict)
     fields: Mapping[str, str] = field(default_factory=dict)
     names: Mapping[str, str] = field(default_factory=dict)
-    is_harmless: bool = False
+    is_harmless: bool = False  # the job does what was asked for
 
 
 def hostile_uploads(rig: bytes) -> list[Hostile]:
@@ -48,16 +39,15 @@ def hostile_uploads(rig: bytes) -> list[Hostile]:
 
 
 def _parts(rig: bytes) -> Iterator[Hostile]:
-    bomb = pa.table(
-        {"camera": pa.DictionaryArray.from_arrays(pa.array(np.zeros(10**7, np.int8)), ["l"])}
-    )
+    names = pa.DictionaryArray.from_arrays(pa.array(np.zeros(10**7, np.int8)), ["l"])
+    pq.write_table(pa.table({"camera": names}), bomb := io.BytesIO())
     contents = {
         "python object": ("rig", b"a: !!python/object/apply:os.system ['true']\n"),
         "control characters": ("rig", rig + b"\x00\x1b[2J"),
         "huge image": ("rig", rig.replace(b"width_px: 1240", b"width_px: 1e300")),
         "zip for a rig": ("rig", zipped({"rig.yaml": rig})),
         "empty rig": ("rig", b""),
-        "bomb of one column": ("correspondences", _parquet(bomb)),
+        "bomb of one column": ("correspondences", bomb.getvalue()),
         "mark alone": ("correspondences", b"PAR1PAR1"),
         "CSV of one line": ("correspondences", b"a" * 20_000_000),
         "CSV of a million columns": ("correspondences", b"," * 1_000_000),
@@ -121,13 +111,13 @@ def _archives() -> Iterator[Hostile]:
 
 def _recordings() -> Iterator[Hostile]:
     image = f"cameras/{_CAMERA}/000000.jpg"
-    png = f"cameras/{_CAMERA}/000000.png"
+    bomb = png(_HUGE_PX, _HUGE_PX, bytes(_HUGE_PX * 100))  # kilobytes for 3.6 gigapixels
     good = _dataset()
     without = {name: content for name, content in good.items() if name != image}
     header = b"{'descr': '<f8', 'fortran_order': False, 'shape': (9000000000, 4), }"
     huge = b"\x93NUMPY\x01\x00" + struct.pack("<H", 118) + header.ljust(117) + b"\n" + bytes(64)
     contents = {
-        "image bomb": zipped({**without, png: _png_bomb()}),
+        "image bomb": zipped({**without, f"cameras/{_CAMERA}/000000.png": bomb}),
         "SVG for an image": zipped({**good, image: b"<svg onload='alert(1)'/>"}),
         "cloud of 288 GB": zipped({**good, "lidar/000000.npy": huge}),
         "ROS 1 with a huge record": b"#ROSBAG V2.0\n" + struct.pack("<I", 2**31 - 1) + bytes(50),
@@ -164,35 +154,10 @@ def _link() -> bytes:
     return out.getvalue()
 
 
-def _parquet(table: pa.Table) -> bytes:
-    out = io.BytesIO()
-    pq.write_table(table, out)
-    return out.getvalue()
-
-
-def _png_bomb() -> bytes:
-    """Some kilobytes that stand for 3.6 gigapixels."""
-
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        return (
-            struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-        )
-
-    size = struct.pack(">IIBBBBB", _HUGE_PX, _HUGE_PX, 8, 0, 0, 0, 0)
-    lines = zlib.compress(bytes(_HUGE_PX * 100))
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", size) + chunk(b"IDAT", lines) + chunk(b"IEND", b"")
-
-
 def as_form(upload: Hostile, rig: bytes, table: bytes) -> tuple[list, dict[str, str]]:  # type: ignore[type-arg]
     """The files and the fields of a form, the good parts with the hostile ones."""
-    good: dict[str, bytes] = {}
-    if upload.kind == "solve":
-        good = {"rig": rig, "correspondences": table}
-    if upload.kind == "check":
-        good = {"rig": rig}
-    files = {**good, **upload.files}
+    good = {"solve": {"rig": rig, "correspondences": table}, "check": {"rig": rig}}
+    files = {**good.get(upload.kind, {}), **upload.files}
     parts = [(name, (upload.names.get(name, name), content)) for name, content in files.items()]
-    fields = dict(upload.fields)
-    if upload.kind == "solve" and "settings" not in fields:
-        fields["settings"] = json.dumps({"report": False})
-    return parts, fields
+    settings = {"settings": json.dumps({"report": False})} if upload.kind == "solve" else {}
+    return parts, {**settings, **upload.fields}

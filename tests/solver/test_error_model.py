@@ -30,7 +30,13 @@ from calibgraph.solver.covariance import with_pseudo_frames
 from calibgraph.solver.error_model import fit_errors
 from calibgraph.solver.joint import solve_joint
 from calibgraph.solver.matches import camera_blocks
-from calibgraph.solver.pair_refinement import PairFit, fit_pairs, shared_variance_ratio
+from calibgraph.solver.pair_refinement import (
+    PairFit,
+    fit_pairs,
+    place_pairs,
+    shared_variance_ratio,
+)
+from calibgraph.solver.pairs import pair_terms
 from calibgraph.solver.places import ErrorFit
 from calibgraph.solver.robust import ResidualScale
 from calibgraph.solver.sources import variances_by_source
@@ -164,7 +170,7 @@ def of_matches(errors: ErrorFit) -> np.ndarray:
     From the dense covariance C: C G C, with G the information of each of these.
     """
     linear = errors.linear
-    weight, values, parts = linear.weights, all_values(linear), errors.model.components
+    weight, values, parts = linear.ties.weight.T, all_values(linear), errors.model.components
     cameras = weight[:, 1:, None, None]
     parts = replace(
         parts,
@@ -187,9 +193,8 @@ def of_matches(errors: ErrorFit) -> np.ndarray:
         factor = data.at(number)
         rows = np.concatenate([starts[key] + np.arange(6) for key in list(factor.keys())])
         information[np.ix_(rows, rows)] += factor.information()
-    shown = np.einsum("pn,pnij->ij", parts.distortion_weight, parts.distortion_information)
     rows = starts[DISTORTION] + np.arange(3)
-    information[np.ix_(rows, rows)] += shown
+    information[np.ix_(rows, rows)] += parts.distortion_information
     for number, (place, camera) in enumerate(model.matched_places):
         edge = model.place_graph.at(model.places + number)
         root = edge.noiseModel().R()
@@ -247,7 +252,9 @@ def test_its_size_is_found_from_what_cameras_see_in_common(mixed_rig: Rig, size:
 def fits_of(rig: Rig) -> list[PairFit]:
     """Where exact images place the cameras."""
     held = np.array([np.diag(EACH)] * len(rig.cameras))
-    return fit_pairs(rig, simulated_pairs(rig), Config(), held)
+    terms = pair_terms(rig, simulated_pairs(rig))
+    T = rig.T_camera_lidar
+    return fit_pairs(terms, T, held, place_pairs(terms, T))
 
 
 def test_it_is_never_taken_for_less_than_usual_and_as_usual_without_tied_cameras(pair: Rig) -> None:

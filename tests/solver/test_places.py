@@ -173,7 +173,6 @@ def with_correlations(model: LatentPoseModel) -> LatentPoseModel:
         pair_distortion_jacobian=pair_jacobian,
         distortion_information=parts.distortion_information + np.diag([0.5, 1.0, 2.0]),
         distortion_vector=parts.distortion_vector + np.array([0.4, -0.3, 0.8]),
-        distortion_weight=rng.uniform(0.2, 1.0, parts.distortion_weight.shape),
         distortion_size=1.5,
     )
     return replace(model, components=components)
@@ -182,7 +181,7 @@ def with_correlations(model: LatentPoseModel) -> LatentPoseModel:
 def test_a_pair_of_which_the_gate_has_left_nothing_takes_no_part(pair: Rig) -> None:
     table, matches = table_of(pair, 6, False, []), simulated_pairs(pair, count=40)
     solution = solve_joint(pair, table, Config(learnt_weights=False), camera_matches=matches)
-    term = pair_terms(pair, matches, Config())[0].with_sigma(1.0)
+    term = pair_terms(pair, matches)[0].with_sigma(1.0)
     empty = term.select(np.zeros(len(term.frame), np.bool_))
     more = replace(solution.inliers, pairs=(*solution.inliers.pairs, empty))
     found, expected = (
@@ -239,7 +238,7 @@ def test_of_one_camera_and_place_the_covariance_is_the_sum_of_all_parts(pair: Ri
 
 def with_distortion(parts: VarianceComponents) -> np.ndarray:
     """(6, 6) covariance of the first camera's matches by the scan distortion."""
-    shown = np.einsum("pn,pnij->ij", parts.distortion_weight, parts.distortion_information)
+    shown = parts.distortion_information
     covariance = np.linalg.inv(np.eye(len(shown)) / parts.distortion_size + shown)
     jacobian = parts.distortion_jacobian[0]
     return np.asarray(jacobian @ covariance @ jacobian.T)

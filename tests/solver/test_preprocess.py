@@ -1,10 +1,8 @@
-"""The filters keep the right rows, in parts as of the whole table; weights; the robust spread."""
+"""The filters keep the right rows; weights; the robust spread."""
 
 from __future__ import annotations
 
-import tracemalloc
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +19,7 @@ from calibgraph import (
     Rig,
     simulate_correspondences,
 )
-from calibgraph.io import tables as correspondence_tables
 from calibgraph.solver import preprocess
-from calibgraph.solver.preprocess import Preprocessed
 from calibgraph.solver.robust import (
     constrained_error_px,
     iterate_spread,
@@ -42,16 +38,6 @@ COLUMNS = (
     "frame", "pixels_px", "points_lidar_m", "confidence", "information_px", "stamp_ns",
     "point_index",
 )  # fmt: skip
-
-
-SMALL_PART, FEW_MERGED = 257, 300
-
-
-@pytest.fixture
-def small_parts(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Parts so small that frames are split and what is kept is merged again and again."""
-    monkeypatch.setattr(correspondence_tables, "_PART_ROWS", SMALL_PART)
-    monkeypatch.setattr(preprocess, "_MERGED_ROWS", FEW_MERGED)
 
 
 def shuffled(rig: Rig, seed: int) -> Correspondences:
@@ -113,17 +99,6 @@ def by_hand(
     return kept, counts
 
 
-def assert_same(found: Preprocessed, expected: Preprocessed) -> None:
-    assert found.counts == expected.counts
-    assert found.table.metadata == expected.table.metadata
-    names = [[t.cameras[i] for i in t.camera_index] for t in (found.table, expected.table)]
-    assert names[0] == names[1]
-    for column in COLUMNS:
-        np.testing.assert_array_equal(
-            getattr(found.table, column), getattr(expected.table, column), err_msg=column
-        )
-
-
 def test_preprocessing_keeps_what_is_kept_by_hand(mixed_rig: Rig) -> None:
     table, config = shuffled(mixed_rig, 1), Config(confidence_min=0.4)
     kept = preprocess.preprocess(mixed_rig, table, config)
@@ -134,29 +109,11 @@ def test_preprocessing_keeps_what_is_kept_by_hand(mixed_rig: Rig) -> None:
         assert counts[name].items() <= kept.counts[name].items()
 
 
-@pytest.mark.usefixtures("small_parts")
-@pytest.mark.parametrize("matches_max", [10_000, 150])
-@pytest.mark.parametrize("row_group_size", [100, 1000, 10**6])
-@pytest.mark.parametrize("seed", [2, 3])
-def test_a_file_in_parts_gives_what_the_whole_table_gives(
-    mixed_rig: Rig, tmp_path: Path, seed: int, row_group_size: int, matches_max: int
-) -> None:
-    table = shuffled(mixed_rig, seed)
-    config = Config(confidence_min=0.4, matches_max=matches_max)
-    path = saved(table, tmp_path / "table.parquet", row_group_size=row_group_size)
-    found = preprocess.preprocess(mixed_rig, path, config)
-    assert_same(found, preprocess.preprocess(mixed_rig, table, config))
-    if matches_max == 150:  # the cap took some: of every camera, 4 frames have 150 left
-        assert [c["capped"] for c in found.counts.values()] == [600] * 3
-
-
-@pytest.mark.usefixtures("small_parts")
 def test_a_solve_of_a_file_is_that_of_the_table_to_the_last_bit(pair: Rig, tmp_path: Path) -> None:
     errors = MatcherErrors(noise_px=1.0, frame_noise_px=0.3, outlier_share=0.2)
     table = simulate_correspondences(pair, frames=6, matches=300, errors=errors)
     path = saved(table, tmp_path / "table.parquet")
-    config = Config(bootstrap=5)
-    one, other = (calibgraph.solve(pair, given, config) for given in (path, table))
+    one, other = (calibgraph.solve(pair, given) for given in (path, table))
     for name in pair.cameras:
         np.testing.assert_array_equal(one.T_camera_lidar[name], other.T_camera_lidar[name])
         np.testing.assert_array_equal(one.covariance[name], other.covariance[name])
@@ -164,11 +121,8 @@ def test_a_solve_of_a_file_is_that_of_the_table_to_the_last_bit(pair: Rig, tmp_p
     assert one.counts == other.counts
 
 
-@pytest.mark.usefixtures("small_parts")
-@pytest.mark.parametrize("row", [3, SMALL_PART, 5 * SMALL_PART + 11])
-def test_a_bad_row_is_counted_from_the_beginning_of_the_file(
-    pair: Rig, tmp_path: Path, row: int
-) -> None:
+def test_a_bad_row_of_a_file_is_named(pair: Rig, tmp_path: Path) -> None:
+    row = 1296
     arrow = to_arrow(simulate_correspondences(pair, frames=4, matches=300))
     index = arrow.column_names.index("u_px")
     for bad, message in (
@@ -181,28 +135,6 @@ def test_a_bad_row_is_counted_from_the_beginning_of_the_file(
         parquet.write_table(changed, tmp_path / "table.parquet")
         with pytest.raises(FileError, match=message):
             calibgraph.solve(pair, tmp_path / "table.parquet")
-
-
-@pytest.mark.usefixtures("small_parts")
-def test_memory_does_not_grow_with_the_table(pair: Rig) -> None:
-    """Four times the rows of the same frames may take no more memory, but for the allocator."""
-    part = simulate_correspondences(pair, frames=2, matches=4000)
-
-    def parts(count: int) -> Iterator[Correspondences]:
-        rng = np.random.default_rng(count)
-        for _ in range(count):
-            yield part.select(rng.permutation(len(part)))
-
-    def peak_bytes(count: int) -> int:
-        tracemalloc.start()
-        kept = preprocess.preprocess_parts(pair, parts(count), Config())
-        peak = tracemalloc.get_traced_memory()[1]
-        tracemalloc.stop()
-        assert sum(c["given"] for c in kept.counts.values()) == count * len(part)
-        return peak
-
-    peak_bytes(2)  # compiles
-    assert peak_bytes(24) < 1.1 * peak_bytes(6)
 
 
 def test_the_cap_keeps_the_most_confident_of_every_frame(pair: Rig) -> None:

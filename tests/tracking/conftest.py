@@ -16,7 +16,6 @@ from calibgraph import (
 )
 from calibgraph.io.rigs import load_rig
 from calibgraph.tracking import command
-from calibgraph.tracking.history import History
 from tests.conftest import Call
 from tests.tracking.drives import (
     World,
@@ -40,9 +39,8 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> World:
 
 
 @pytest.fixture
-def no_picture(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Drawing and loading ahead take a second, and have tests of their own."""
-    monkeypatch.setattr(History, "draw", lambda self, path: path.write_bytes(b""))
+def not_warmed_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Loading ahead takes a second."""
     monkeypatch.setattr(command, "warm_up_tracker", lambda: None)
 
 

@@ -20,9 +20,7 @@ from calibgraph import (
     Rig,
 )
 from calibgraph.tracking.assessment import json_lines
-from calibgraph.tracking.frame_order import StreamFrame
-from calibgraph.trust.pose_posterior import PosePosterior
-from factors import pose_sigmas
+from calibgraph.tracking.frames import StreamFrame
 from tests.conftest import make_camera
 from tests.draws.drives import simulate_drive
 from tests.draws.places import Drawn
@@ -110,13 +108,6 @@ def frames_in(out: str) -> list[int]:
 
 def left_out(err: str) -> list[str]:
     return [line for line in err.splitlines() if line.startswith("left out: ")]
-
-
-def flat(rad: float, m: float) -> PosePosterior:
-    """Samples of a posterior that is as wide."""
-    sigmas = pose_sigmas(rotation_rad=rad, translation_m=m)
-    samples = sigmas * np.random.default_rng(0).standard_normal((4000, 6))
-    return PosePosterior(samples, samples, 0.0)
 
 
 @dataclass

@@ -20,7 +20,6 @@ from calibgraph import (
 )
 from calibgraph.cli import app
 from calibgraph.tracking import durable
-from calibgraph.tracking.history import History
 from tests.tracking.drives import (
     drive,
     frames_in,
@@ -29,7 +28,7 @@ from tests.tracking.drives import (
 
 MOST_TOGETHER = 50  # frames of one write: all its lines come again
 
-pytestmark = pytest.mark.usefixtures("no_picture")
+pytestmark = pytest.mark.usefixtures("not_warmed_up")
 
 
 def _command(arguments: list[str], lines: Path, state_every: int) -> None:
@@ -39,7 +38,6 @@ def _command(arguments: list[str], lines: Path, state_every: int) -> None:
         os.dup2(file, descriptor)
     sys.stdout, sys.stderr = os.fdopen(1, "w"), os.fdopen(2, "w")
     durable._STATE_EVERY = state_every
-    History.draw = lambda self, path: path.write_bytes(b"")  # type: ignore[method-assign]
     sys.argv = ["calibgraph", "track", *arguments]
     app.main()
 

@@ -28,12 +28,12 @@ from calibgraph import (
 )
 from calibgraph.tracking import durable, tracker
 from calibgraph.tracking.assessment import json_lines
-from calibgraph.tracking.frame_order import StreamFrame
-from calibgraph.tracking.state_database import DATABASE, StateDatabase
+from calibgraph.tracking.durable import DATABASE, StateDatabase
+from calibgraph.tracking.frames import StreamFrame
 from tests.conftest import KANNALA, Call
 from tests.tracking.drives import World, drive_at, moved, pair_of, step_of
 
-pytestmark = pytest.mark.usefixtures("no_picture")
+pytestmark = pytest.mark.usefixtures("not_warmed_up")
 
 
 def test_a_refused_update_changes_neither_the_tracker_nor_the_disk(
@@ -206,7 +206,7 @@ def test_the_folder_does_not_grow_with_the_number_of_states(tmp_path: Path) -> N
 ACKNOWLEDGING = """
 import os, random, sys
 from pathlib import Path
-from calibgraph.tracking.state_database import StateDatabase
+from calibgraph.tracking.durable import StateDatabase
 
 database = StateDatabase(Path(sys.argv[1]))
 lines = b"\\n".join(database.read()).splitlines()

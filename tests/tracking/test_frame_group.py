@@ -19,7 +19,7 @@ from calibgraph import (
 )
 from calibgraph.model.correspondences import concatenate
 from calibgraph.tracking.assessment import Update
-from calibgraph.tracking.frame_order import StreamFrame
+from calibgraph.tracking.frames import StreamFrame
 from tests.tracking.drives import drive, drive_at, pair_of
 
 EPOCH = 10

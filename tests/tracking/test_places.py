@@ -17,7 +17,16 @@ from calibgraph import (
     Update,
     concatenate,
 )
-from calibgraph.graph.variables import camera_key
+from calibgraph.graph.objective import join
+from calibgraph.graph.variables import (
+    CLOUD,
+    DISTORTION,
+    aligned_key,
+    camera_key,
+    cloud_at_key,
+    matched_at_key,
+    matched_key,
+)
 from calibgraph.model.geometry import (
     relative_covariance,
     relative_transform,
@@ -26,12 +35,11 @@ from calibgraph.model.geometry import (
     twist_between,
 )
 from calibgraph.solver.joint import solve_joint
-from calibgraph.solver.places import start_values
 from calibgraph.tracking import DurableCalibrator, IncrementalCalibrator
+from calibgraph.tracking.estimate import Terms, every_place
 from calibgraph.trust.evidence import gather
 from tests.conftest import stereo_relative_pose
 from tests.draws.places import Drawn, draw_places, tied
-from tests.solver.latent import all_values
 from tests.tracking.drives import drive, pair_of, track_draw
 
 Array = np.ndarray
@@ -181,19 +189,61 @@ def tracked_at_three_places(frames: int, **config: object) -> tuple[IncrementalC
     return tracker, update
 
 
+def whole_graph(tracker: IncrementalCalibrator) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+    """The error model with the poses of all places, by stock factors, and all poses as reported."""
+    state, epoch = tracker._state, tracker._graph
+    every = every_place(state, epoch.places, state.all_sums())
+    rows = np.flatnonzero(every.frames.any(axis=1))
+    terms = Terms.of(state, every, rows, epoch.open_spread(state, every))
+    graph, no_motion = join(epoch.window.model.shared_graph), gtsam.Pose3()
+    poses = [to_T_lidar_camera(T) for T in tracker.rig.T_camera_lidar.values()]
+    size = epoch.window.model.components.distortion_jacobian.shape[2]
+    at = {CLOUD: no_motion, DISTORTION: np.zeros(size)}
+    covariance, information = (
+        lambda own: robust(gtsam.noiseModel.Gaussian.Covariance(own), terms.robust_scale),
+        gtsam.noiseModel.Gaussian.Information,
+    )
+    for place in range(len(rows)):
+        cloud, of_cloud = cloud_at_key(place), covariance(np.linalg.inv(terms.cloud[place]))
+        graph.add(gtsam.BetweenFactorPose3(CLOUD, cloud, no_motion, of_cloud))
+        at[cloud] = no_motion
+        for camera in np.flatnonzero(terms.seen[place]).tolist():
+            reference = to_T_lidar_camera(state.references[camera])
+            shown, own = reference.retract(terms.minimum[place, camera]), terms.root[place, camera]
+            key, known = matched_at_key(place, camera), own @ own.T / terms.least[camera]
+            apart = covariance(terms.at_place[place, camera])
+            graph.add(gtsam.BetweenFactorPose3(matched_key(camera), key, no_motion, apart))
+            graph.add(gtsam.BetweenFactorPose3(cloud, key, shown, information(known)))
+            at[key] = poses[camera]
+    for of in (camera_key, aligned_key, matched_key):
+        at |= {of(camera): pose for camera, pose in enumerate(poses)}
+    values = gtsam.Values()
+    for key in graph.keyVector():
+        values.insert(key, at[key])
+    return graph, values
+
+
+def robust(noise: gtsam.noiseModel.Gaussian, scale: float) -> gtsam.noiseModel.Base:
+    if not np.isfinite(scale):
+        return noise
+    return gtsam.noiseModel.Robust.Create(
+        gtsam.noiseModel.mEstimator.GemanMcClure.Create(scale), noise
+    )
+
+
 def test_what_is_reported_is_optimum_and_marginal_of_the_graph() -> None:
     """By GTSAM's LM and Marginals: within 0.02 sigma, and half a percent of the covariance.
 
     Places have the weights in their robust loss that they had at the end of the last epoch.
     """
     tracker, update = tracked_at_three_places(24)
-    model, graph = tracker._graph.whole_model(tracker._state), tracker.graph
-    start = all_values(start_values(model, update.T_camera_lidar))
+    graph, start = whole_graph(tracker)
     values = gtsam.LevenbergMarquardtOptimizer(graph, start).optimize()
     marginals = gtsam.Marginals(graph, values)
-    for key, name in zip(model.reported_keys, ("left", "right"), strict=True):
+    keys = tracker._graph.window.model.reported_keys
+    for camera, (key, name) in enumerate(zip(keys, ("left", "right"), strict=True)):
         reported = update.covariance[name]
-        found = marginals.marginalCovariance(key)
+        found = marginals.marginalCovariance(key) + tracker._state.lens_errors[camera]
         units = np.sqrt(np.outer(np.diag(reported), np.diag(reported)))
         np.testing.assert_allclose(found / units, reported / units, atol=5e-3)
         T = to_T_camera_lidar(values.atPose3(key))
@@ -201,18 +251,21 @@ def test_what_is_reported_is_optimum_and_marginal_of_the_graph() -> None:
         assert np.abs(apart).max() < 0.02
 
 
-def test_with_a_preset_of_the_paper_the_graph_is_equation_5() -> None:
+def test_with_a_preset_of_the_paper_the_estimate_is_that_of_equation_5() -> None:
+    """Priors, and a quadratic per camera."""
     tracker, update = tracked_at_three_places(12, preset="kitti")
-    graph, values = tracker.graph, gtsam.Values()
+    state, values = tracker._state, gtsam.Values()
+    graph, sums = join(tracker._graph.pose_graph), state.all_sums()
     for camera, T in enumerate(update.T_camera_lidar.values()):
-        values.insert(camera_key(camera), to_T_lidar_camera(T))
-    assert graph.keyVector() == [camera_key(0), camera_key(1)]
+        key, at = camera_key(camera), gtsam.Values()
+        at.insert(key, to_T_lidar_camera(state.references[camera]))
+        own = gtsam.HessianFactor(key, sums.hessian[camera], -sums.gradient[camera], 0.0)
+        graph.add(gtsam.LinearContainerFactor(own, at))
+        values.insert(key, to_T_lidar_camera(T))
     found = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
     for camera, (name, T) in enumerate(update.T_camera_lidar.items()):
-        own, covariance = (
-            to_T_camera_lidar(found.atPose3(camera_key(camera))),
-            update.covariance[name],
-        )
+        own = to_T_camera_lidar(found.atPose3(camera_key(camera)))
+        covariance = update.covariance[name]
         assert np.abs(twist_between(own, T) / np.sqrt(np.diag(covariance))).max() < 0.01
 
 

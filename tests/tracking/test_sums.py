@@ -10,7 +10,6 @@ from calibgraph import Config, Correspondences, MatcherErrors, Rig, simulate_cor
 from calibgraph.solver.matches import BlockResiduals, CameraBlock, camera_blocks
 from calibgraph.solver.preprocess import preprocess
 from calibgraph.tracking.eliminate import eliminate
-from calibgraph.tracking.noise import BINS, add_residuals, scale_of
 from calibgraph.tracking.state import STRENGTHS
 from calibgraph.tracking.sums import MOST_PLACES, PlaceSums, Sums
 
@@ -166,20 +165,6 @@ ERRORS = MatcherErrors(noise_px=1.0, frame_noise_px=0.5, outlier_share=0.1)
 def matches_of(rig: Rig, table: Correspondences, name: str) -> CameraBlock:
     kept = preprocess(rig, table, Config())
     return camera_blocks(rig, kept.table, Config())[name]
-
-
-def test_the_histogram_finds_the_scale_of_all_frames(pair: Rig) -> None:
-    """Its bins are 1 % wide and values within them are taken as even: 0.3 % is a third of one."""
-    table = simulate_correspondences(pair, frames=40, matches=300, errors=ERRORS, seed=5)
-    T = pair.T_camera_lidar["left"]
-    histogram = np.zeros((2, BINS))
-    for frame in range(40):
-        block = matches_of(pair, table.select(table.frame == frame), "left")
-        histogram = add_residuals(histogram, BlockResiduals.at(T, block))
-    expected = matches_of(pair, table, "left").scale(T, Config())
-    found = scale_of(histogram, block.least_spread, Config())
-    assert found.sigma_px == pytest.approx(expected.sigma_px, rel=3e-3)
-    assert found.gate_px == pytest.approx(expected.gate_px, rel=3e-3)
 
 
 def test_the_gates_share_of_the_hessian_is_that_of_moved_gates(pair: Rig) -> None:

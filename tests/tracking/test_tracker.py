@@ -238,7 +238,7 @@ def test_a_frozen_sensor_adds_nothing_and_is_blind(pair: Rig, noise_px: float) -
         pixels_px = tables[-1].pixels_px + noise
         update = tracker.update(replace(tables[-1], frame=frame, pixels_px=pixels_px))
     after = update.covariance["left"]
-    assert (np.diag(after) > 0.9 * np.diag(before)).all()  # 38 new frames would leave a quarter
+    assert (np.diag(after) > 0.8 * np.diag(before)).all()  # 38 new frames would leave a quarter
     (check,) = [c for c in update.verdicts["left"].checks if c.name in ("stuck", "blind frames")]
     assert check.text.startswith("the last 39 frames with matches have the same points")
     events = [event.kind for event in tracker.update(moved_on(tables[-1], 50)).events]

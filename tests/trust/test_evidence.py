@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 import calibgraph
 from calibgraph import (
     Calibration,
-    Config,
     Correspondences,
     MatcherErrors,
     Rig,
@@ -25,7 +24,8 @@ from calibgraph import (
 )
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.solver.joint import solve_joint
-from calibgraph.solver.pair_refinement import fit_pairs
+from calibgraph.solver.pair_refinement import fit_pairs, place_pairs
+from calibgraph.solver.pairs import pair_terms
 from calibgraph.trust.agreement import PairAgreement, check_agreement, pair_agreement
 from calibgraph.trust.evidence import gather
 from factors import pose_sigmas
@@ -120,7 +120,9 @@ SIGMAS = pose_sigmas(rotation_rad=np.radians(0.05), translation_m=0.01)
 
 
 def agreement(rig: Rig, table: CameraMatches) -> PairAgreement:
-    (fit,) = fit_pairs(rig, table, Config(), np.array([np.diag(SIGMAS**2)] * 2))
+    terms, held = pair_terms(rig, table), np.array([np.diag(SIGMAS**2)] * 2)
+    T = rig.T_camera_lidar
+    (fit,) = fit_pairs(terms, T, held, place_pairs(terms, T))
     return pair_agreement(rig, fit, np.diag(np.tile(SIGMAS**2, 2)))
 
 

@@ -43,10 +43,10 @@ RIG = load_rig(SAMPLE)
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A copy of the sample's first frames."""
+    """A copy of the sample's first frame."""
     copy = Path(shutil.copytree(SAMPLE, tmp_path / "sample"))
     for path in (*copy.glob("lidar/*"), *copy.glob("cameras/*/*")):
-        if path.stem > "000001":
+        if path.stem > "000000":
             path.unlink()
     return copy
 
@@ -214,7 +214,7 @@ def test_every_error_has_its_words_and_is_recognised_by_undoing_it() -> None:
     ("error", "seed"),
     [
         ("inverse", 1),
-        ("camera-upside-down", 4),
+        pytest.param("camera-upside-down", 4, marks=SLOW),
         pytest.param("cloud-ahead-right-down", 3, marks=SLOW),
         pytest.param("camera-flu", 2, marks=SLOW),
         pytest.param("cloud-behind-right-up", 3, marks=SLOW),

@@ -31,7 +31,6 @@ from calibgraph.trust.evidence import Checks
 from calibgraph.trust.matcher_checks import repeated_file_checks
 from calibgraph.trust.observability import weakest_direction
 from tests.conftest import SAMPLE
-from tests.draws.lenses import with_known_lenses
 from tests.trust.conftest import named, simulated
 
 
@@ -291,18 +290,3 @@ def test_the_share_of_the_priors_is_their_influence(pair: Rig) -> None:
     strong = solve(pair, table, Config(prior_weight=1e12))
     assert strong.prior_share["left"] > 0.99
     assert named(strong, "left", "share of the priors")[0].status == "WARN"
-
-
-def test_the_bootstrap_agrees_with_the_reported_covariance(pair: Rig) -> None:
-    table, pair = simulated(pair, frames=30), with_known_lenses(pair)
-    result = solve(pair, table, Config(bootstrap=100))
-    one, again = (solve(pair, table, Config(bootstrap=5)).bootstrap for _ in range(2))
-    for name, covariance in result.bootstrap.items():
-        np.testing.assert_array_equal(one[name], again[name])
-        ratio = np.sqrt(np.diag(covariance) / np.diag(result.covariance[name]))
-        # Of the reported variance 8 / 38 stand for what 30 frames leave unsaid; 100 draws give
-        # a standard deviation to 7 %.
-        assert (ratio > 0.65).all() and (ratio < 1.15).all()
-        (check,) = named(result, name, "bootstrap")
-        # The check's scatter is of both cameras jointly, the reported one of each by itself.
-        assert check.status == "PASS" and check.value == pytest.approx(ratio.max(), rel=0.1)

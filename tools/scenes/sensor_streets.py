@@ -114,7 +114,7 @@ def _align(camera: Camera, stated: Camera, points: np.ndarray, met: np.ndarray) 
     inside = in_front & (pixels >= 0).all(axis=1) & (pixels < size).all(axis=1)
     rows = np.flatnonzero(inside)
     rows = rows[:: max(1, len(rows) // _MOST)]
-    block = ProjectionBlock(stated.lens, points[rows], pixels[rows], loss="l2")
+    block = ProjectionBlock(stated.lens, points[rows], pixels[rows], scale=np.inf)
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     graph.add(block_factor(0, block))
     values.insert(0, to_T_lidar_camera(stated.T_camera_lidar))

@@ -6,10 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
-from calibgraph.errors import FileError
 from calibgraph.files import checked_model
 from calibgraph.io.bags.messages import describe_message
 from calibgraph.io.lenses import (
@@ -29,7 +27,7 @@ _SAME_SHARE = 2e-3
 """Of the focal length, and of distortion, rotation and baseline: the error of a calibration."""
 
 
-def same_lens(one: CameraLens, other: CameraLens) -> bool:
+def _same_lens(one: CameraLens, other: CameraLens) -> bool:
     """Whether two lenses are one, within the errors of a calibration."""
     if (one.model, one.size_px) != (other.model, other.size_px):
         return False
@@ -67,17 +65,11 @@ class StatedLens:
         T[:3, 3] = self.baseline_m if with_baseline else 0.0
         return T
 
-    def in_words(self) -> str:
-        """Size, focal length, centre and frame."""
-        size, k = self.lens.size_px, self.lens.intrinsics_px
-        pixels = f"{size[0]}x{size[1]} px, " if size else ""
-        return f"{pixels}fx {k.fx:.6g}, cx {k.cx:.6g}, frame {self.frame!r}"
-
     def agrees(self, other: StatedLens) -> bool:
         """Whether it is the same but for what a calibration leaves open: some drivers jitter."""
         turned = np.abs(self.R_image_frame - other.R_image_frame).max()
         moved = np.abs(self.baseline_m - other.baseline_m).max()
-        return self.frame == other.frame and same_lens(self.lens, other.lens) and bool(
+        return self.frame == other.frame and _same_lens(self.lens, other.lens) and bool(
             max(turned, moved) < _SAME_SHARE
         )  # fmt: skip
 
@@ -85,44 +77,6 @@ class StatedLens:
     def is_turned(self) -> bool:
         """Whether the axes of the image and of the frame differ."""
         return bool(np.abs(self.R_image_frame - np.eye(3)).max() > _SAME)
-
-
-class LensStates:
-    """The lenses in a topic's CameraInfo messages, one after another: a zoom may change them.
-
-    Attributes:
-        since_ns: from when each counts [ns]: half way from the last message of the one before.
-        lenses: one or more; empty if no message has a lens.
-        without: number of messages without a lens.
-    """
-
-    def __init__(self, where: str, *, rectified: bool) -> None:
-        self.since_ns: list[int] = []
-        self.lenses: list[StatedLens] = []
-        self.without = 0
-        self._where, self._rectified = where, rectified
-        self._last: tuple[Any, int] = None, 0
-
-    def add(self, message: Any, record_ns: int) -> None:
-        """Take in the next message."""
-        fields = (each for name, each in vars(message).items() if name != "header")
-        key = [message.header.frame_id] + [
-            each.tobytes() if isinstance(each, np.ndarray) else each for each in fields
-        ]
-        if key != self._last[0]:
-            try:
-                lens = lens_of(message, self._where, rectified=self._rectified)
-            except FileError:
-                self.without += 1
-                return
-            if not self.lenses or not lens.agrees(self.lenses[-1]):
-                self.since_ns.append((self._last[1] + record_ns) // 2 if self.lenses else 0)
-                self.lenses.append(lens)
-        self._last = key, record_ns
-
-    def which(self, record_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-        """(n,) which lens counts at times of recording [ns]."""
-        return np.searchsorted(self.since_ns, record_ns, side="right") - 1
 
 
 def lens_of(message: Any, where: str, *, rectified: bool) -> StatedLens:

@@ -30,11 +30,6 @@ _YUV = {
     "yuv422_yuy2": cv2.COLOR_YUV2BGR_YUY2, "yuyv": cv2.COLOR_YUV2BGR_YUY2,
     "yuy2": cv2.COLOR_YUV2BGR_YUY2, "yvyu": cv2.COLOR_YUV2BGR_YVYU,
 }  # fmt: skip
-_TWO_PLANES = {
-    "nv12": (cv2.COLOR_YUV2BGR_NV12, 0.5), "nv21": (cv2.COLOR_YUV2BGR_NV21, 0.5),
-    "nv24": (cv2.COLOR_YUV2BGR_NV12, 2.0), "nv42": (cv2.COLOR_YUV2BGR_NV21, 2.0),
-}  # fmt: skip
-"""OpenCV's conversion, and the bytes of the second plane, of colour, over those of the gray one."""
 _OPENCV_CHANNELS = {"1": "mono", "3": "bgr", "4": "bgra"}
 _DEPTHS = (8, 10, 12, 14, 16)
 
@@ -72,8 +67,6 @@ def _of_pixels(message: Any, where: str) -> Image:
     if encoding.lower() in _YUV:
         pixels = _pixels(message, 2, "u1", where)
         return np.asarray(cv2.cvtColor(pixels, _YUV[encoding.lower()]), dtype=np.uint8)
-    if encoding.lower() in _TWO_PLANES:
-        return _of_two_planes(message, *_TWO_PLANES[encoding.lower()], where)
     layout, bits = _layout(encoding, where)
     kind = "u1" if bits == 8 else (">u2" if message.is_bigendian else "<u2")  # noqa: PLR2004
     return _to_bgr(_to_8_bits(_pixels(message, _CHANNELS.get(layout, 1), kind, where)), layout)
@@ -90,7 +83,7 @@ def _layout(encoding: str, where: str) -> tuple[str, int]:
     raise DatasetError(
         f"{where}: image encoding {encoding!r} is unknown; known are mono, bgr, rgb, bgra, rgba "
         "and bayer_* with 8 or 16, 8UC and 16UC with 1, 3 or 4, "
-        f"{', '.join((*_YUV, *_TWO_PLANES))}: convert it, or choose another topic"
+        f"{', '.join(_YUV)}: convert it, or choose another topic"
     )
 
 
@@ -104,36 +97,6 @@ def _pixels(message: Any, channels: int, kind: str, where: str) -> NDArray[Any]:
     rows = np.lib.stride_tricks.as_strided(data, (height, width * item), (step, 1), writeable=False)
     pixels = np.ascontiguousarray(rows).view(kind)
     return pixels if channels == 1 else pixels.reshape(height, -1, channels)
-
-
-def _of_two_planes(message: Any, conversion: int, colour_share: float, where: str) -> Image:
-    """The image of a gray plane and a colour plane of half its rows and columns.
-
-    The stated height is the image's or, with some drivers, the height of both planes.
-    """
-    data, width = np.ascontiguousarray(message.data), message.width
-    height, step = _plane_size(message, 1 + colour_share, where)
-    gray = data[: height * step].reshape(height, step)[:, :width]
-    colour = data[height * step : int(height * step * (1 + colour_share))]
-    if colour_share > 1:
-        pairs = colour.reshape(height, step, 2)[::2, :width:2]
-    else:
-        pairs = colour.reshape(height // 2, step)[:, :width]
-    planes = np.vstack([gray, pairs.reshape(height // 2, width)])
-    return np.asarray(cv2.cvtColor(planes, conversion), dtype=np.uint8)
-
-
-def _plane_size(message: Any, planes: float, where: str) -> tuple[int, int]:
-    """Height and bytes per gray row; ``planes`` is the size of both planes over the gray one's."""
-    length = len(message.data)
-    for height in (message.height, int(message.height / planes)):
-        for step in (message.step, message.width):
-            is_stated = (height, step) == (message.height, message.step)
-            size, is_even = height * step * planes, message.width % 2 == 0 == height % 2
-            fits = size == length or (is_stated and size <= length)
-            if fits and is_even and 0 < message.width <= step:
-                return height, step
-    raise _incomplete(message, where)
 
 
 def _incomplete(message: Any, where: str) -> DatasetError:

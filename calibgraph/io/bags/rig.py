@@ -2,7 +2,6 @@
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from shlex import quote
@@ -17,8 +16,8 @@ from calibgraph.io.bags.storage import BagOptions
 from calibgraph.io.bags.topics import CameraTopics, choose_topics
 from calibgraph.io.bags.transforms import Transforms
 from calibgraph.io.lenses import CameraLens
-from calibgraph.io.rig_parts import RelativeCamera, RigParts, find_mounts
-from calibgraph.model.geometry import angle_deg, relative_transform
+from calibgraph.io.rig_parts import RigParts, find_mounts
+from calibgraph.model.geometry import angle_deg
 from calibgraph.model.rig import Rig
 
 _UPWARD = 0.9
@@ -52,16 +51,10 @@ def read_bag_rig(path: Path, options: BagOptions | None = None) -> RigParts:
         lidar=lidar,
         notes=(*notes, *(f"{path}: {each}: at most one of them is there" for each in both)),
         why_missing=reader.why_missing,
-        why_untied="".join(both[:1]),
     )
 
 
-def rig_of_bag(
-    path: Path | str,
-    options: BagOptions | None = None,
-    *,
-    relative_sigmas: tuple[float, float] | None = None,
-) -> Rig:
+def rig_of_bag(path: Path | str, options: BagOptions | None = None) -> Rig:
     """The rig that a bag describes: lenses from CameraInfo, T_camera_lidar from /tf_static.
 
     The frames are those that the messages name: the camera's optical frame (x right, y down, z
@@ -70,31 +63,11 @@ def rig_of_bag(
     Args:
         path: the bag.
         options: which topics; those found by type if None.
-        relative_sigmas: make the cameras' relative poses in /tf_static measurements, of these
-            sigmas in rotation [rad] and translation [m]. None: they are only a guess, as what is
-            drawn in a URDF has not been measured.
 
     Raises:
         FileError, DatasetError: if the bag is damaged, or a topic, a lens or a transform missing.
     """
-    return tied_rig(read_bag_rig(Path(path), options), relative_sigmas)
-
-
-def tied_rig(parts: RigParts, sigmas: tuple[float, float] | None) -> Rig:
-    """The rig of a bag; with sigmas, the poses of cameras in the first are measurements of it."""
-    if sigmas is not None and parts.why_untied:
-        raise DatasetError(
-            f"{parts.path}: {parts.why_untied}, so their relative pose is not known and cannot be "
-            "taken as measured; leave out --tie-deg and --tie-m, or write relative_poses into the "
-            "rig file"
-        )
-    rig = parts.to_rig()
-    if sigmas is None:
-        return rig
-    first, *others = rig.T_camera_lidar.items()
-    pairs = (RelativeCamera(first[0], name, relative_transform(first[1], T), *sigmas)
-             for name, T in others)  # fmt: skip
-    return replace(parts, relative_poses=tuple(pairs)).to_rig()
+    return read_bag_rig(Path(path), options).to_rig()
 
 
 def doubtful_axes(rig: Rig) -> list[str]:

@@ -8,7 +8,6 @@ EXPORT_FORMATS: Final[Mapping[str, str]] = {
     "ros2-launch": "ROS 2 launch file (.launch.xml) of static_transform_publisher nodes",
     "urdf": "URDF with a fixed joint per camera and LiDAR: base LiDAR -> their frames",
     "autoware": "Autoware's sensor_kit_calibration.yaml, and sensors_calibration.yaml beside it",
-    "kitti": "KITTI odometry's calib.txt: P0 to P3 and Tr",
     "camera_info": "folder of a ROS camera_info YAML per camera: lenses, no extrinsics",
     "opencv": "OpenCV FileStorage YAML: matrices, distortion, T_camera_lidar",
     "json": "plain JSON: T_camera_lidar, T_lidar_camera, lenses, covariance",
@@ -18,8 +17,7 @@ EXPORT_FORMATS: Final[Mapping[str, str]] = {
 IMPORT_FORMATS: Final = (
     "Kalibr camchain, ROS camera_info and transforms (files, or as ros2 topic echo prints them), "
     "OpenCV FileStorage (.yaml, .json), Autoware sensor kit, parameters of FAST-LIVO, URDF, "
-    "static_transform_publisher in launch files (XML) and scripts (.sh), a matrix in a file named "
-    "cam_to_velo or velo_to_cam, KITTI's calib.txt, a ROS bag, a rig file, a result or a JSON "
-    "export of calibgraph"
+    "static_transform_publisher in launch files (XML) and scripts (.sh), KITTI's calib.txt, a ROS "
+    "bag, a rig file, a result or a JSON export of calibgraph"
 )
 """What ``calibgraph rig`` reads."""

@@ -5,7 +5,6 @@ Lenses that a format cannot carry are refused, not rounded.
 
 import json
 import logging
-import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -346,8 +345,6 @@ _WHICH = {"urdf": _joints, "autoware": _sensor_kit}
 
 _MODELS: Final = {"pinhole": "plumb_bob", "fisheye": "equidistant", "omnidirectional": "mei"}
 _PLUMB_BOB = 5
-_SAME = 1e-9  # of rotation matrices: rounding in double precision
-_MOST = 4
 _MAPS = f"T_camera_lidar maps LiDAR to camera coordinates: {FRAMES_SENTENCE}"
 
 
@@ -405,57 +402,6 @@ def _projection(name: str, camera: Camera) -> dict[str, Any]:
         "distortion_model": distortion,
         "distortion_coeffs": coefficients,
     }
-
-
-def write_kitti(export: RigExport) -> str:
-    """P_k = K [I | b] per camera and Tr; without comments, at which readers of others stop."""
-    numbers = _numbers(export)
-    first, *_ = export.cameras.values()
-    Tr = first.T_camera_lidar[:3]
-    lines = []
-    for name, camera in export.cameras.items():
-        if camera.model != "pinhole":
-            raise no_place_for(name, camera, "KITTI's calib.txt")
-        carried_coefficients(name, camera, 0, "KITTI's calib.txt")
-        if np.abs(camera.T_camera_lidar[:3, :3] - Tr[:, :3]).max() > _SAME:
-            raise CalibrationError(
-                f"camera {name!r}: KITTI's calib.txt has one rotation for all cameras, and this "
-                "one differs from the first; write one file per camera with --camera",
-                camera=name,
-            )
-        b = camera.T_camera_lidar[:3, 3:] - Tr[:, 3:]
-        P = camera.matrix_px @ np.hstack([np.eye(3), b])
-        lines.append(_line(f"P{numbers[name]}", P))
-    return "".join([*sorted(lines), _line("Tr", Tr)])
-
-
-def kitti_statement(export: RigExport) -> list[str]:
-    """The direction, for a file beside calib.txt."""
-    numbers = _numbers(export)
-    return export.statement(
-        "calib.txt: the pixel of p_lidar is P_k * [Tr; 0 0 0 1] * p_lidar, with P_k = K [I | b]; "
-        "Tr maps LiDAR to rectified camera coordinates",
-        "T_camera_lidar of camera k is Tr with K^-1 P_k[:, 3] added to its translation",
-        f"cameras: {', '.join(f'{name} is P{k}' for name, k in numbers.items())}",
-    )
-
-
-def _numbers(export: RigExport) -> dict[str, int]:
-    """The k of P_k per camera: the number in image_k, else its place in the order."""
-    found = {name: re.fullmatch(r"image_0?([0-3])", name) for name in export.cameras}
-    numbers = {name: int(match[1]) for name, match in found.items() if match}
-    if len(set(numbers.values())) == len(export.cameras):
-        return numbers
-    if len(export.cameras) > _MOST:
-        raise CalibrationError(
-            f"KITTI's calib.txt holds {_MOST} cameras, these are {len(export.cameras)}; choose "
-            "some with --camera"
-        )
-    return {name: k for k, name in enumerate(export.cameras)}
-
-
-def _line(key: str, matrix: Array) -> str:
-    return f"{key}: {' '.join(repr(float(value)) for value in matrix.ravel())}\n"
 
 
 def write_camera_infos(export: RigExport) -> Mapping[str, str]:
@@ -566,13 +512,11 @@ Writer = Callable[[RigExport], str | Mapping[str, str]]
 WRITERS: Final[Mapping[str, Writer]] = {
     "kalibr": write_kalibr,
     **{name: partial(write_transforms, format=name) for name in TRANSFORMS},
-    "kitti": write_kitti,
     "camera_info": write_camera_infos,
     "opencv": write_opencv,
     "json": write_json,
 }
 _WITH_BASE = "autoware"
-_WITHOUT_COMMENTS = "kitti"
 _KIT_IN_VEHICLE = "sensors_calibration.yaml"
 
 
@@ -604,9 +548,9 @@ def export_calibration(  # noqa: PLR0913
         force: whether to replace files that are there.
 
     Returns:
-        The files: one, and for ``kitti``, which has no comments, a text file beside it; for
-        ``camera_info`` one of each camera; for ``autoware`` sensors_calibration.yaml beside it,
-        if the rig has the LiDAR in the vehicle; if not, a line is logged that names why.
+        The files: one; for ``camera_info`` one of each camera; for ``autoware``
+        sensors_calibration.yaml beside it, if the rig has the LiDAR in the vehicle; if not, a line
+        is logged that names why.
 
     Raises:
         CalibrationError: if the verdict is FAIL, or the format or the file cannot hold it.
@@ -689,8 +633,6 @@ def _write(export: RigExport, path: Path, format: str, *, force: bool) -> tuple[
     contents = {path: written} if isinstance(written, str) else {
         path / name: content for name, content in written.items()
     }  # fmt: skip
-    if format == _WITHOUT_COMMENTS:
-        contents[path.with_name(f"{path.stem}.direction.txt")] = commented(kitti_statement(export))
     if format == _WITH_BASE and (of_vehicle := sensors_calibration(export)):
         contents[path.with_name(_KIT_IN_VEHICLE)] = of_vehicle
     for file in contents:

@@ -20,14 +20,11 @@ from calibgraph.files import checked_model, read_json, read_text, require_file
 from calibgraph.io.bags import is_bag
 from calibgraph.io.bags.camera_info import lens_of
 from calibgraph.io.bags.rig import read_bag_rig
-from calibgraph.io.clouds import read_npy
 from calibgraph.io.formats.foreign_keys import Foreign, read_foreign
-from calibgraph.io.kitti import CALIBRATION_NAME, NumberLines
+from calibgraph.io.kitti import CALIBRATION_NAME
 from calibgraph.io.lenses import CameraLens
 from calibgraph.io.rig_parts import (
     ONLY_CAMERA,
-    RELATIVE_SIGMA_CM,
-    RELATIVE_SIGMA_DEG,
     Link,
     Links,
     RelativeCamera,
@@ -42,8 +39,8 @@ from calibgraph.io.rig_parts import (
     pose_of_quaternion,
 )
 from calibgraph.io.rigs import is_exported_rig, read_rig
-from calibgraph.model.geometry import T_OPTICAL_LINK, invert
-from calibgraph.model.rig import KNOWLEDGE, Finite, Mount, Rig, Size, rigid_transform
+from calibgraph.model.geometry import T_OPTICAL_LINK
+from calibgraph.model.rig import KNOWLEDGE, Finite, Mount, Rig, Size
 from calibgraph.yaml_text import parse_yaml_documents
 
 _PUBLISHER = "static_transform_publisher"
@@ -250,50 +247,6 @@ def _three_numbers(text: str, joint: ElementTree.Element, path: Path) -> list[fl
     return [x, y, z]
 
 
-_TO_LIDAR = re.compile(r"cam[a-z]*_?(to|2)_?(velo|lidar)", re.IGNORECASE)
-_TO_CAMERA = re.compile(r"(velo[a-z]*|lidar)_?(to|2)_?cam", re.IGNORECASE)
-_SIZES = (12, 16)
-
-
-def read_matrix(path: Path, name: str | None) -> RigParts:
-    """The extrinsic in a file of one matrix, 3 x 4 or 4 x 4, as KITTI and others write it.
-
-    Its name states the direction: cam_to_velo is p_velo = M p_cam, velo_to_cam is p_cam = M p_velo.
-    """
-    if path.suffix.lower() == ".npy":
-        M = read_npy(path)
-        if M.dtype.kind not in "fiu" or M.size not in _SIZES:
-            raise FileError(path, f"holds {M.shape} of {M.dtype}, expected 3 x 4 or 4 x 4")
-    elif len(M := _numbers_of_text(path)) not in _SIZES:
-        text = read_text(path)
-        first = next((line for line in text.splitlines() if line.strip()), "")
-        raise FileError(path, _unknown(f"its line {first[:40]!r} is", text))
-    rows = [*M.astype(np.float64).reshape(-1, 4), [0.0, 0.0, 0.0, 1.0]]
-    try:
-        T = rigid_transform(np.array(rows[:4]))
-    except ValueError as error:
-        raise FileError(path, f"the matrix: {error}") from error
-    to_lidar, to_camera = (bool(each.search(path.stem)) for each in (_TO_LIDAR, _TO_CAMERA))
-    if to_lidar == to_camera:
-        raise FileError(
-            path, "holds a matrix, and its name states no direction; name the file cam_to_velo.txt "
-            "if p_velo = M p_cam, velo_to_cam.txt if p_cam = M p_velo"
-        )  # fmt: skip
-    return RigParts(path, T_camera_lidar={name or ONLY_CAMERA: invert(T) if to_lidar else T})
-
-
-def _numbers_of_text(path: Path) -> Array:
-    """Of KITTI's lines R and T, or of a text of numbers alone; none of another."""
-    text = read_text(path)
-    if re.search(r"^R:", text, re.MULTILINE) and re.search(r"^T:", text, re.MULTILINE):
-        lines = NumberLines(path)
-        return np.hstack([lines.array("R", 3, 3), lines.array("T", 3, 1)]).ravel()
-    try:
-        return np.array([float(word) for word in text.replace(",", " ").split()])
-    except ValueError:
-        return np.empty(0)
-
-
 _MAX_BYTES, _HEAD_BYTES = 32 * 2**20, 2**16
 
 
@@ -310,8 +263,6 @@ def read_part(path: Path, name: str | None) -> RigParts:  # noqa: PLR0911 - a li
         return _read_xml(path)
     if suffix in (".sh", ".bash"):
         return read_publishers(read_text(path).splitlines(), path)
-    if suffix in (".txt", ".csv", ".npy"):
-        return read_matrix(path, name)
     if suffix in (".yaml", ".yml", ".json"):
         return _read_content(_read_documents(path), path, name)
     with path.open("rb") as file:
@@ -465,8 +416,6 @@ def import_rig(
     lidar_frame: str | None = None,
     camera_frames: Mapping[str, str] | None = None,
     size_px: tuple[int, int] | None = None,
-    relative_sigma_deg: float = RELATIVE_SIGMA_DEG,
-    relative_sigma_cm: float = RELATIVE_SIGMA_CM,
 ) -> Rig:
     """Build a rig from files of other programs, which together hold lenses and extrinsics.
 
@@ -477,8 +426,6 @@ def import_rig(
         lidar_frame: the LiDAR's frame among those of the files; the one with such a name if None.
         camera_frames: per camera, its frame, where the names differ.
         size_px: width and height of images whose file has none.
-        relative_sigma_deg: 1 sigma per axis of relative poses whose file has none.
-        relative_sigma_cm: likewise of their translation.
 
     Raises:
         CalibrationError: if a file is malformed, a lens is none of ours, or something is missing.
@@ -486,9 +433,7 @@ def import_rig(
     parts = read_rig_parts(
         files, names=names, rename=rename, lidar_frame=lidar_frame, camera_frames=camera_frames
     )
-    return parts.to_rig(
-        size_px=size_px, relative_sigma_deg=relative_sigma_deg, relative_sigma_cm=relative_sigma_cm
-    )
+    return parts.to_rig(size_px=size_px)
 
 
 def read_rig_parts(

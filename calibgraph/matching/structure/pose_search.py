@@ -34,18 +34,17 @@ from calibgraph.model.rig import Camera, Rig
 
 SEARCH_WINDOWS, DENSE_WINDOWS = 2100, 9000  # of the maps, per camera over all frames
 FEW_EFFORT = 2
-"""In few frames maps are of dense windows, there are more candidates of a box search by this
-factor, and all are refined. In single frames of KITTI 05, 06 and raw 0005 right poses stand out by
-a z-score of 9 to 13 instead of 5 to 9 in these maps, where the best wrong ones have 9 to 11."""
+"""In few frames maps are of dense windows, and there are more candidates of a box search by this
+factor. In single frames of KITTI 05, 06 and raw 0005 right poses stand out by a z-score of 9 to 13
+instead of 5 to 9 in these maps, where the best wrong ones have 9 to 11."""
 ROLLS_RAD = np.radians([0.0, -12.0, 12.0])
 """Windows lie in the maps as they are seen from the guess: if it is rolled by more than some 8
 degrees, right places stand out no more."""
-SURVIVORS = 2  # candidates of a roll that are refined, those that are best after an approach
-
 SAME_DEG, SAME_CM = 1.0, 30.0
 """Poses nearer than this are the same: the rounds correct the error that refinements leave."""
 
 DRAWS_AROUND, AROUND_RAD, AROUND_M = 12, np.radians(4.0), 0.8  # per axis
+SURVIVORS = 2  # of these that are refined, those that are best after an approach
 MAX_LOOKS = 3
 
 PROMISING, FEW_PROMISING = 10.6, 9.0
@@ -127,9 +126,8 @@ class PoseSearch:
     def with_roll(self, body: Body, roll_rad: float, *, effort: int) -> Candidate:
         """The best pose all over the range about a body's guess, with maps for one roll.
 
-        All candidates of the box search are approached, and the best are refined; with few
-        frames all are, also without an approach, which may lead away from the right pose, but not
-        twice at one pose.
+        All candidates of the box search are refined, after an approach and without one, which may
+        lead away from the right pose, but not twice at one pose.
         """
         maps = self._correlate(_turn_about_axis(body, roll_rad), effort)
         nothing = Candidate(body, -math.inf)
@@ -140,14 +138,13 @@ class PoseSearch:
         more = FEW_EFFORT * effort if self._few else effort
         found = search_box(maps, box, cores, effort=more, seed=self._seed + effort)
         starts = [place(body, T_lead_lidar) for T_lead_lidar in found]
-        near = list(self._while_time(approach, starts))
-        near.sort(key=_by_z_score, reverse=True)
-        if self._few:
-            survivors = distinct([*(one.body for one in near), *starts])
-        else:
-            survivors = [one.body for one in near[: effort * SURVIVORS]]
-        refined = self._while_time(refine, survivors)
-        return self._settle(max(refined, key=_by_z_score, default=nothing))
+        near = sorted(self._while_time(approach, starts), key=_by_z_score, reverse=True)
+        best = nothing
+        for candidate in self._while_time(refine, distinct([*(one.body for one in near), *starts])):
+            best = max(best, candidate, key=_by_z_score)
+            if best.z_score >= CONFIDENT:
+                break
+        return self._settle(best)
 
     def _while_time(
         self, improve: Callable[[Mapping[str, CameraFrames], Body], Candidate], bodies: list[Body]

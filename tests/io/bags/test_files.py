@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import builtins
 import bz2
-import json
 import sqlite3
 import struct
 import subprocess
@@ -364,34 +363,37 @@ BOMBS: dict[str, tuple[Callable[[Path], Path], str]] = {
     "computed data": (computed(GENERATED), "string or blob too big"),
 }
 READ = """
-import json, resource, sys, time
+import resource, sys, time
 from pathlib import Path
 from calibgraph.errors import CalibrationError
 from calibgraph.io.bags.messages import Bag, type_store
 import zstandard, lz4.frame, rosbags.rosbag1, mcap.records, bz2
 type_store(ros1=True), type_store(ros1=False)
-before, start, text = resource.getrusage(resource.RUSAGE_SELF), time.process_time(), "read"
-try:
-    bag = Bag(Path(sys.argv[1]))
-    for _ in bag.messages([*bag.topics]):
-        pass
-except CalibrationError as error:
-    text = str(error)
-after = resource.getrusage(resource.RUSAGE_SELF)
-print(json.dumps([text, time.process_time() - start, (after.ru_maxrss - before.ru_maxrss) / 1024]))
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+for path in sys.argv[1:]:
+    start, text = time.process_time(), "read"
+    try:
+        bag = Bag(Path(path))
+        for _ in bag.messages([*bag.topics]):
+            pass
+    except CalibrationError as error:
+        text = str(error)
+    grown_mb = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
+    print(time.process_time() - start, grown_mb, text)
 """
 
 
-@pytest.mark.parametrize("name", BOMBS)
-def test_a_bomb_is_one_line_in_little_time_and_memory(tmp_path: Path, name: str) -> None:
-    make, expected = BOMBS[name]
-    path = make(tmp_path)
-    done = subprocess.run(
-        [sys.executable, "-c", READ, path], capture_output=True, text=True, check=True, timeout=60
-    )
-    line, taken_s, grown_mb = json.loads(done.stdout)
-    assert expected in line and "\n" not in line and str(tmp_path) in line
-    assert taken_s < MOST_S and grown_mb < MOST_MB
+def test_a_bomb_is_one_line_in_little_time_and_memory(tmp_path: Path) -> None:
+    paths = []
+    for name, (make, _) in BOMBS.items():
+        (folder := tmp_path / name).mkdir()
+        paths.append(make(folder))
+    command = [sys.executable, "-c", READ, *paths]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
+    for (name, (_, expected)), line in zip(BOMBS.items(), done.stdout.splitlines(), strict=True):
+        taken_s, grown_mb, text = line.split(maxsplit=2)
+        assert expected in text and str(tmp_path) in text, name
+        assert float(taken_s) < MOST_S and float(grown_mb) < MOST_MB, name
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -105,35 +105,6 @@ def test_yuv_is_read() -> None:
         assert abs(found[0, 0, 0] - (117 - 16) * 255 / 219) <= 1
 
 
-@pytest.mark.parametrize("counts_both", [False, True])
-@pytest.mark.parametrize("encoding", ["nv12", "nv21", "nv24", "nv42", "NV12"])
-@pytest.mark.parametrize("padding", [0, 64])
-def test_a_gray_and_a_colour_plane_are_the_image_of_the_camera(
-    encoding: str, padding: int, counts_both: bool
-) -> None:
-    colours = np.kron(BGR[::8, ::8], np.ones((8, 8, 1), np.uint8))  # no edge between subsamples
-    height, width = colours.shape[:2]
-    planar = cv2.cvtColor(colours, cv2.COLOR_BGR2YUV_I420).ravel()
-    gray, u, v = np.split(planar, [height * width, height * width * 5 // 4])
-    pairs = np.dstack([u, v] if encoding.lower() in ("nv12", "nv24") else [v, u])
-    pairs = pairs.reshape(height // 2, width // 2, 2)
-    if encoding.endswith(("24", "42")):
-        pairs = pairs.repeat(2, axis=0).repeat(2, axis=1)
-    lines = [np.pad(plane, ((0, 0), (0, padding * plane.shape[1] // width))).ravel()
-             for plane in (gray.reshape(height, width), pairs.reshape(len(pairs), -1))]  # fmt: skip
-    message = MAKE.image(gray.reshape(height, width), encoding, START_NS)
-    message.data, message.step = np.concatenate(lines), width + padding
-    if counts_both:
-        message.height = len(message.data) // message.step
-    found = image_from_message(message, "here")
-    assert found.shape == colours.shape
-    # the 8 bits of YUV are coarser than those of BGR by 255 / 219 and up to 2.02 for blue
-    np.testing.assert_allclose(found.astype(int), colours, atol=4)
-    message.data = message.data[: -message.step]
-    with pytest.raises(DatasetError, match=f"px, encoding '{encoding}'; record it again"):
-        image_from_message(message, "here")
-
-
 @pytest.mark.parametrize(
     ("encoding", "order"),
     [("uyvy", "uy"), ("yuy2", "yu"), ("yvyu", "yv"), ("yuyv", "yu"), ("YUV422_YUY2", "yu")],

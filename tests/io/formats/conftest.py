@@ -37,9 +37,6 @@ def varied_rig() -> Rig:
 
 def rig_for(format: str) -> Rig:
     """A rig with as much as a format can hold."""
-    if format == "kitti":
-        left = make_camera((0.3, 0.1, -0.1))
-        return Rig(cameras={"image_2": left, "image_3": make_camera((0.3, -0.43, -0.12))})
     return varied_rig()
 
 

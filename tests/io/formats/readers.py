@@ -109,19 +109,6 @@ def autoware(path: Path) -> Poses:
     }
 
 
-def kitti(path: Path) -> Poses:
-    """KITTI: pixel = P_k [Tr; 0 0 0 1] p, and P_k = K [I | b]."""
-    lines = dict(line.split(":") for line in path.read_text().splitlines())
-    matrices = {key: np.array(text.split(), float).reshape(3, 4) for key, text in lines.items()}
-    poses = {}
-    for key in matrices.keys() - {"Tr"}:
-        K, P = matrices[key][:, :3], matrices[key]
-        T = np.vstack([matrices["Tr"], [0, 0, 0, 1]])
-        T[:3, 3] += np.linalg.solve(K, P[:, 3])
-        poses[f"image_{key[1]}"] = T
-    return poses
-
-
 def opencv(path: Path) -> Poses:
     """By OpenCV."""
     file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
@@ -139,7 +126,6 @@ READERS = {
     "ros2-launch": ros2_launch,
     "urdf": urdf,
     "autoware": autoware,
-    "kitti": kitti,
     "opencv": opencv,
     "json": plain_json,
 }

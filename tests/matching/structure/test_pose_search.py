@@ -127,7 +127,7 @@ def literal_z_score(maps: CorrelationMaps, T: np.ndarray) -> float:
 
 def test_z_scores_are_those_of_the_literal_formula() -> None:
     rng = np.random.default_rng(0)
-    maps, transforms = make_maps(rng), make_transforms(rng, 50)
+    maps, transforms = make_maps(rng), make_transforms(rng, 15)
     expected = [literal_z_score(maps, T) for T in transforms]
     np.testing.assert_allclose(maps.z_scores(transforms), expected, rtol=2e-3, atol=2e-3)
 
