@@ -7,7 +7,8 @@ import json
 import os
 import re
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
@@ -35,7 +36,7 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = None
     try:
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=".writing-", suffix=path.suffix)
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=_PREFIX, suffix=path.suffix)
         os.close(handle)
         temporary = Path(name)
         write(temporary)
@@ -97,6 +98,67 @@ def require_place_for_folder(folder: Path) -> None:
     existing = next(part for part in (folder, *folder.parents) if part.exists())
     if not os.access(existing, os.W_OK):
         raise FileError(existing, "may not be written to; choose another folder")
+
+
+_PREFIX = ".writing-"
+INDEX_FILES = (
+    "calibration.yaml", "doctor.json", "fleet_model.json", "session.json", "state/state.sqlite"
+)  # fmt: skip
+"""A folder that holds one of these is a command's own, and may be written again."""
+
+
+def require_own_folder(folder: Path, read: Iterable[Path] = ()) -> None:
+    """Check, before hours of work, that a command may write its files into a folder.
+
+    Raises:
+        FileError: if there is no place for it, if it holds files and none of ``INDEX_FILES``, or if
+            it is read itself.
+    """
+    require_place_for_folder(folder)
+    names = [path.name for path in folder.iterdir()] if folder.is_dir() else []
+    if all(name.startswith(_PREFIX) for name in names):  # of writers that were killed
+        return
+    if not any((folder / name).is_file() for name in INDEX_FILES):
+        raise FileError(
+            folder,
+            f"holds files, but no {INDEX_FILES[0]} or other index file of calibgraph; choose "
+            "another folder, or empty this one",
+        )
+    if any(path.is_dir() and path.samefile(folder) for path in read):
+        raise FileError(
+            folder, "is read by this command, which would write into it; choose another --out"
+        )
+
+
+@contextmanager
+def written_together(folder: Path, *, last: str) -> Iterator[Path]:
+    """In the body, a folder for files that are moved into ``folder`` at its end.
+
+    After an error in it, as of a full disk, none of them is there, and older ones are as they were.
+    The file named ``last`` is moved last: if the process is killed, it is not there before others.
+
+    Raises:
+        FileError: if there is no place for them.
+        OSError: if they cannot be written; with the path where the file should be.
+    """
+    require_place_for_folder(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        made = tempfile.TemporaryDirectory(dir=folder, prefix=_PREFIX)
+    except OSError as error:
+        raise cannot_write(folder, error) from error
+    with made as name:
+        try:
+            yield Path(name)
+        except OSError as error:  # of a file where it will be, not where it is written
+            error.filename = error.filename and str(error.filename).replace(name, str(folder), 1)
+            raise
+        for new in sorted(Path(name).iterdir(), key=lambda path: path.name == last):
+            try:
+                new.replace(folder / new.name)
+            except OSError as error:
+                raise cannot_write(folder / new.name, error) from error
+        sync_folder(folder)
 
 
 def is_utf8(name: str) -> bool:

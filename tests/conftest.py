@@ -148,7 +148,7 @@ class CommandRun:
 
 
 def leave_out_diagrams(patch: pytest.MonkeyPatch) -> None:
-    for name in ("convergence", "coverage", "residual_map", "residual_scatter"):
+    for name in ("coverage", "residual_map"):
         patch.setattr(plots, name, lambda *_: "data:image/png;base64,")
 
 

@@ -11,20 +11,16 @@ GTSAM factor per correspondence, a copy of memory as large as the table.
 
 from __future__ import annotations
 
-import contextlib
-import inspect
 import json
 import os
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from statistics import median
-from typing import Any
 
 import gtsam
 import numpy as np
@@ -35,11 +31,9 @@ from benchmarks.speed.incremental import GUESS, frames
 from benchmarks.tables import ROOT, Table, parser_of
 from calibgraph import (
     Correspondences,
-    Dataset,
     IncrementalCalibrator,
     MatcherErrors,
     Rig,
-    StructureMatcher,
     calibrate,
     load_correspondences,
     load_dataset,
@@ -49,11 +43,8 @@ from calibgraph import (
     solve,
 )
 from calibgraph.graph.objective import objective_graph, pose_key
-from calibgraph.matching.structure import correlation_maps, shift_scores
-from calibgraph.matching.structure.score_kernel import LANES, LINES
 from calibgraph.model.geometry import to_T_camera_lidar
 from calibgraph.parallel import THREADS_VARIABLE
-from calibgraph.progress import no_progress
 from calibgraph.simulation.rigs import rig_of
 from calibgraph.solver.matches import camera_blocks
 from calibgraph.solver.two_pass import Objective, to_values
@@ -66,7 +57,6 @@ WORST = 1.25
 _TRIES = 3  # of a ratio that fails
 MATRIX = 1024  # rows of the square matrices
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-FAR_DEG, FAR_M = 15.0, 1.0  # of a guess that is not accepted, so that a search begins
 _ENVIRONMENT = {**ONE_THREAD, "NUMBA_NUM_THREADS": "1", THREADS_VARIABLE: "1"}
 _FRAMES, _CAMERAS = 2, 2  # of the sample, that are calibrated
 _UPDATES = 40  # of a tracker
@@ -142,7 +132,6 @@ def all_pairs(folder: Path) -> Iterator[Pair]:
     Args:
         folder: for a table.
     """
-    yield kernel()
     small, large = Problem.draw(10), Problem.draw(100)
     yield solve_of(small, "2 x 10 x 1000", times=2, pairs=9)
     yield solve_of(large, "2 x 100 x 1000", times=3, pairs=3)
@@ -150,74 +139,6 @@ def all_pairs(folder: Path) -> Iterator[Pair]:
     yield update(small)
     yield reading(large, folder / "correspondences.parquet")
     yield whole()
-
-
-def kernel() -> Pair:
-    """Window scores, per multiply-add of their definition, over those of sgemm."""
-    calls, times = matcher_calls(load_dataset(SAMPLE)), 4
-    work = sum(map(multiply_adds, calls))
-
-    def run() -> None:  # each call adds to the same grids again
-        for call in calls:
-            shift_scores.score_windows(*call.values())
-
-    unit = work / (times * MATRIX**3)
-    return Pair("window scores / sgemm, per multiply-add", run, _sgemm(times), 5, unit)
-
-
-class _EnoughError(Exception):
-    """The search has made its call."""
-
-
-def multiply_adds(call: dict[str, Any]) -> int:
-    """Multiply-adds by the definition of the score, however it is computed.
-
-    For each point and shift inside the image a product with depth, intensity, one, itself, and
-    with both trends where these are not zero.
-
-    Args:
-        call: arguments of the kernel by the names of its parameters.
-    """
-    size = np.array(call["grids"].shape[:0:-1])  # columns, rows
-    image = np.array(call["padded"].shape[::-1]) - (LANES, LINES)
-    low, high = call["places"].min(axis=1), call["places"].max(axis=1)
-    first = np.maximum(call["origin"], -low)
-    last = np.minimum(call["origin"] + size, image - high)
-    products = 4 + 2 * np.any(call["basis"][:, :, 2:], axis=(1, 2))
-    return int(np.sum(call["counts"] * np.maximum(0, last - first).prod(axis=1) * products))
-
-
-def matcher_calls(dataset: Dataset) -> list[dict[str, Any]]:
-    """The kernel's calls for one camera and frame: by the search, and in each round."""
-    name = next(iter(dataset.rig.cameras))
-    rig, one = Rig(cameras={name: dataset.rig.cameras[name]}), dataset.select("0")
-    matcher, calls = StructureMatcher(), list[dict[str, Any]]()
-    far = perturb(rig, rotation_deg=FAR_DEG, translation_m=FAR_M)
-    with recorded(correlation_maps, calls, stop=True), contextlib.suppress(_EnoughError):
-        matcher.locate(one, far, out_of_time=lambda: False, progress=no_progress)
-    for index in range(matcher.rounds):
-        with recorded(shift_scores, calls):
-            matcher.match(one, rig, round_index=index, progress=no_progress)
-    return calls
-
-
-@contextmanager
-def recorded(module: Any, calls: list[dict[str, Any]], *, stop: bool = False) -> Iterator[None]:
-    """Record the calls of the kernel that a module makes; with ``stop``, none goes on."""
-    kernel = module.score_windows
-    signature = inspect.signature(getattr(kernel, "py_func", kernel))
-
-    def record(*arguments: Any) -> None:
-        calls.append(dict(signature.bind(*arguments).arguments))
-        if stop:
-            raise _EnoughError
-        kernel(*arguments)
-
-    module.score_windows = record
-    try:
-        yield
-    finally:
-        module.score_windows = kernel
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,18 +1,25 @@
 """``check``: is the calibration that is deployed still right?"""
 
 import logging
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
+
+import numpy as np
+from scipy.linalg import block_diag
+from scipy.special import ndtri
 
 from calibgraph.arrays import Array
 from calibgraph.audit.judgement import (
     SEARCHES_FARTHER,
+    deviation_of,
+    find_lidar_motion,
     has_too_few_frames,
     judge_camera,
-    judge_lidar,
+    tail_of_axis,
     tolerance_twist,
 )
+from calibgraph.audit.lidars import MeasuredLidars, measure_lidars
 from calibgraph.audit.result import Audit, CameraAudit, LidarAudit
 from calibgraph.errors import CorrespondenceError, FileError
 from calibgraph.io.calibrations import stated_result
@@ -81,7 +88,8 @@ def check(
     """Compare a deployed calibration with what images and clouds show. Nothing is replaced.
 
     Matching begins at the deployed extrinsics, without a search; the rig's ``relative_poses`` take
-    no part, since they may be as outdated as the extrinsics.
+    no part, since they may be as outdated as the extrinsics. Several LiDARs are measured again in
+    the base.
 
     Args:
         rig: the deployed calibration, of alignments. For the path of a result, the audit also has
@@ -94,7 +102,8 @@ def check(
         progress: called as the work goes on.
 
     Returns:
-        Per camera OK, WRONG or CANNOT TELL, the deviation per axis and its error bar.
+        Per camera, and per LiDAR but the base, OK, WRONG or CANNOT TELL, the deviation per axis and
+        its error bar.
 
     Raises:
         FileError, DatasetError: if the data cannot be read or do not fit together.
@@ -103,35 +112,45 @@ def check(
     """
     tolerance, report = tolerance_twist(tolerance_deg, tolerance_cm), progress or no_progress
     full, watch = find_matcher(matcher, seed=seed), Stopwatch()
-    loaded = (rig if isinstance(rig, Rig) else load_rig(rig)).require_cameras()
+    loaded = rig if isinstance(rig, Rig) else load_rig(rig)
     deployed = loaded.model_copy(update={"relative_poses": ()})
     given = dataset if isinstance(dataset, Dataset) else load_dataset(dataset, deployed)
     same_recording, verdict = (False, None) if isinstance(rig, Rig) else provenance(rig, given)
     with watch("choose_frames"):
-        data = _open(given, deployed, full)
+        data = _open(given, deployed, full) if deployed.cameras else given
+    lidars = None
+    if deployed.other_lidars:
+        sensors = len(deployed.cameras) + len(deployed.other_lidars)
+        with watch("lidars"):
+            lidars = measure_lidars(
+                deployed, given, Config(seed=seed), tolerance, sensors=sensors, progress=report
+            )
+    cameras, evidence = dict[str, CameraAudit](), None
     try:
-        run = match_from_deployed(
-            data, deployed, full, Config(seed=seed), watch=watch, progress=report
-        )
-        with watch("places"):
-            run = assign_places(run)
-        run = refine_with_camera_pairs(run)
-        with watch("checks"):
-            cameras, lidar = _judge(run, tolerance, report)
+        if deployed.cameras:
+            run = match_from_deployed(
+                data, deployed, full, Config(seed=seed), watch=watch, progress=report
+            )
+            with watch("places"):
+                run = assign_places(run)
+            run = refine_with_camera_pairs(run)
+            with watch("checks"):
+                cameras, evidence = _judge(run, tolerance, report)
     except CorrespondenceError as error:
         too_few_matches = error.camera in deployed.cameras and error.row is None
         if not too_few_matches:  # a wrong table
             raise
         nothing = CameraAudit("CANNOT TELL", f"{error}; {SEARCHES_FARTHER}")
         cameras = dict.fromkeys(deployed.cameras, nothing)
-        lidar = None
     finally:
         full.release()
+    lidar = _judge_lidar(evidence, cameras, lidars)
     middle = data.frames[len(data.frames) // 2].with_burnt_in({})  # as it was recorded
     sources = tuple(map(str, data.folders))
     return Audit(
         cameras, lidar, deployed, middle, sources,
         tolerance_deg, tolerance_cm, len(data.frames), watch.seconds, same_recording, verdict,
+        {} if lidars is None else lidars.audits,
     )  # fmt: skip
 
 
@@ -150,15 +169,47 @@ def _open(data: Dataset, deployed: Rig, matcher: FullMatcher) -> Dataset:
 
 def _judge(
     run: MatchingRun, tolerance: Array, progress: Progress
-) -> tuple[dict[str, CameraAudit], LidarAudit | None]:
-    """The audits of all cameras, and of the LiDAR where every measurement can be trusted."""
+) -> tuple[dict[str, CameraAudit], Evidence | None]:
+    """The audits of all cameras, and the evidence where every measurement can be trusted."""
     evidence = gather_of_run(run, asks_guess=True)
     doubts = _doubts(run, evidence, progress)
     cameras = {
         name: judge_camera(evidence, name, doubts[name], tolerance) for name in run.guess.cameras
     }
     trusted = not any(doubts.values()) and all(each.sigma is not None for each in cameras.values())
-    return cameras, judge_lidar(evidence, cameras) if trusted else None
+    return cameras, evidence if trusted else None
+
+
+def _judge_lidar(
+    evidence: Evidence | None, cameras: Mapping[str, CameraAudit], lidars: MeasuredLidars | None
+) -> LidarAudit | None:
+    """The motion of the LiDAR, of several the base, if one explains the deviations of all others.
+
+    None where none is WRONG, or with a single one, which cannot be told from the LiDAR; and where
+    a measurement of a camera cannot be trusted.
+    """
+    deviations, covariances, poses = list[Array](), list[Array](), list[Array]()
+    if cameras:
+        if evidence is None or evidence.joint_covariance is None:
+            return None
+        deviations += [deviation_of(evidence, name) for name in cameras]
+        covariances.append(evidence.joint_covariance)
+        poses += [evidence.guess.T_camera_lidar[name] for name in cameras]
+    audits = {**cameras}
+    if lidars is not None:
+        if not lidars.T_lidar_base:
+            return None
+        deviations.append(lidars.deviation)
+        covariances.append(lidars.covariance)
+        poses += lidars.T_lidar_base
+        audits |= lidars.audits
+    return find_lidar_motion(
+        np.concatenate(deviations),
+        np.asarray(block_diag(*covariances)),
+        poses,
+        moved=[k for k, each in enumerate(audits.values()) if each.status == "WRONG"],
+        quantile=float(ndtri(1 - tail_of_axis(len(audits)))),
+    )
 
 
 def _doubts(run: MatchingRun, evidence: Evidence, progress: Progress) -> dict[str, str]:

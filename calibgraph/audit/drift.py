@@ -13,19 +13,22 @@ from scipy.linalg import block_diag
 from calibgraph.arrays import Array
 from calibgraph.audit.judgement import (
     CAMERA_AXES,
+    LIDAR_AXES,
     SINGLE_CAMERA,
+    SINGLE_LIDAR,
     detectable,
     find_lidar_motion,
     judge_deviation,
     student_quantiles,
     tolerance_twist,
 )
+from calibgraph.audit.lidars import freedom_of_places
 from calibgraph.audit.model import Deviations, Limits, compare, poses_of
 from calibgraph.audit.result import ORDER, CameraAudit, LidarAudit, lidar_summary
 from calibgraph.errors import CalibrationError
 from calibgraph.io.calibrations import load_calibration
 from calibgraph.model.calibration import Calibration
-from calibgraph.model.geometry import pose_rows
+from calibgraph.model.geometry import invert, pose_rows
 from calibgraph.model.result_files import CALIBRATION_FILE
 from calibgraph.model.rig import IMAGE_TIMES
 from calibgraph.model.verdict import COMMON_ERROR
@@ -33,6 +36,8 @@ from calibgraph.solver.covariance import PSEUDO_FRAMES
 
 FALSE_ALARM_RATE = 0.01
 """Probability of a significant axis in one call, over all cameras and results."""
+
+_LIDAR_AXES = tuple(f"{verb} {axis}" for verb in ("about", "along") for axis in "xyz")
 
 _FAILED = "its verdict is FAIL, so that nothing is known of its error: do what its report advises"
 _NO_ERROR_BAR = "it has no error bar: its matches do not determine the camera"
@@ -54,6 +59,7 @@ class Drift:
         tolerance_deg, tolerance_cm: largest turn and shift that are OK.
         false_alarm_rate: probability of one CHANGED or more in this call if nothing has changed.
         same_recording: pairs of results that were made from the same files.
+        lidars: LiDARs but the base, which are among ``cameras``.
     """
 
     results: tuple[str, ...]
@@ -63,6 +69,7 @@ class Drift:
     tolerance_cm: float
     false_alarm_rate: float
     same_recording: tuple[tuple[str, str], ...] = ()
+    lidars: tuple[str, ...] = ()
 
     @property
     def same_recording_note(self) -> str:
@@ -126,7 +133,7 @@ def drift(
     tolerance = tolerance_twist(tolerance_deg, tolerance_cm)
     opened = open_results(results, own_lenses=own_lenses)
     names, loaded, count = (*opened,), (*opened.values(),), len(opened)
-    cameras = [*loaded[0].rig.require_cameras().cameras]
+    cameras = loaded[0].joint_names
     limits = Limits(FALSE_ALARM_RATE / (2 * 6 * len(cameras) * count), tolerance)
     found = {name: _deviations(loaded, name, limits) for name in cameras}
     judged = {name: _judge(opened, name, each, limits) for name, each in found.items()}
@@ -142,6 +149,7 @@ def drift(
         tolerance_cm=tolerance_cm,
         false_alarm_rate=FALSE_ALARM_RATE,
         same_recording=tuple((a, b) for a, b in combinations(names, 2) if hashes[a] & hashes[b]),
+        lidars=tuple(loaded[0].lidar_verdicts),
     )
 
 
@@ -149,10 +157,10 @@ def _why_unusable(result: Calibration, name: str) -> str:
     """Why the pose of a camera takes no part; empty if it does."""
     if not result.error_bar_holds(name):
         return _FAILED
-    covariance = result.covariance[name]
+    covariance = _covariance(result, name)
     if covariance is None or np.linalg.eigvalsh(covariance)[0] <= 0:
         return _NO_ERROR_BAR
-    if any(check.kind == COMMON_ERROR for check in result.camera_verdicts[name].checks):
+    if any(check.kind == COMMON_ERROR for check in result.verdicts[name].checks):
         return _SCATTER_ONLY
     return ""
 
@@ -163,11 +171,45 @@ def _deviations(results: Sequence[Calibration], name: str, limits: Limits) -> De
     if len(usable) < 2:  # noqa: PLR2004 - a comparison
         return None
     seen = [results[place] for place in usable]
-    T_camera_lidar = np.array([each.T_camera_lidar[name] for each in seen])
-    covariance = np.array([each.covariance[name] for each in seen])
-    frames = np.array([each.counts[name].get("frames_used", 1) for each in seen])
-    freedom = np.maximum(frames, 1.0) - 1.0 + PSEUDO_FRAMES
+    T_camera_lidar = np.array([_pose(each, name) for each in seen])
+    covariance = np.array([_covariance(each, name) for each in seen])
+    freedom = np.array([_freedom(each, name) for each in seen])
     return compare(poses_of(usable, T_camera_lidar, covariance, freedom), limits)
+
+
+def _pose(result: Calibration, name: str) -> Array:
+    """(4, 4) T_camera_lidar; of another LiDAR than the base, which counts as a camera, likewise."""
+    if name in result.rig.cameras:
+        return result.T_camera_lidar[name]
+    return invert(result.T_base_lidar[name])
+
+
+def _covariance(result: Calibration, name: str) -> Array | None:
+    """(6, 6) in the sensor's own axes; None without error bar."""
+    if name in result.rig.cameras:
+        return result.covariance[name]
+    covariance, to_own = (result.rig.lidars or {})[name].covariance, _to_own_axes(result, name)
+    return None if covariance is None else to_own @ covariance @ to_own.T
+
+
+def _to_own_axes(result: Calibration, name: str) -> Array:
+    """(6, 6) from the axes in which a result has a covariance, for LiDARs those of the base."""
+    if name in result.rig.cameras:
+        return np.eye(6)
+    return np.asarray(block_diag(*[result.T_base_lidar[name][:3, :3].T] * 2))
+
+
+def _freedom(result: Calibration, name: str) -> float:
+    """Degrees of freedom of a covariance."""
+    if name in result.rig.cameras:
+        frames = result.counts[name].get("frames_used", 1)
+        return max(frames, 1.0) - 1.0 + PSEUDO_FRAMES
+    values = {check.kind or check.name: check.value for check in result.verdicts[name].checks}
+    return freedom_of_places(int(values["lidar_instants"] or 1), len(result.lidar_verdicts))
+
+
+def _axes(result: Calibration, name: str) -> tuple[str, ...]:
+    return CAMERA_AXES if name in result.rig.cameras else LIDAR_AXES
 
 
 def _judge(
@@ -179,12 +221,18 @@ def _judge(
               for each in results.values()]  # fmt: skip
     if found is None:
         return tuple(judged)
-    alone = SINGLE_CAMERA if len(results[names[0]].rig.cameras) == 1 else ""
+    of_one = results[names[0]]
+    alone = SINGLE_CAMERA if of_one.rig.cameras else SINGLE_LIDAR
+    alone = "" if len(of_one.joint_names) > 1 else alone
     for row, place in enumerate(found.poses.results):
         deviation, sigma, freedom = found.deviation[row], found.sigma[row], found.freedom[row]
         quantiles = student_quantiles(freedom, limits.tail)
         status, reason = judge_deviation(
-            deviation, found.covariance[row], quantiles, limits.tolerance
+            deviation,
+            found.covariance[row],
+            quantiles,
+            limits.tolerance,
+            axes=_axes(of_one, camera),
         )
         axes: tuple[int, ...] = ()
         if status == "WRONG":
@@ -249,9 +297,9 @@ def _joint_covariance(
             continue
         if result.joint_covariance is None:
             return None
-        order = [*result.rig.cameras]
+        order = [*result.joint_names]
         columns = np.concatenate([np.r_[pose_rows(order.index(name))] for name in rows])
-        gain = block_diag(*parts)
+        gain = block_diag(*parts) @ block_diag(*[_to_own_axes(result, name) for name in rows])
         whole += gain @ result.joint_covariance[np.ix_(columns, columns)] @ gain.T
     return whole if np.linalg.eigvalsh(whole)[0] > 0 else None
 
@@ -270,7 +318,8 @@ def open_results(given: Results, *, own_lenses: bool) -> dict[str, Calibration]:
         raise CalibrationError(f"{len(loaded)} result given; a comparison needs two or more")
     seen: dict[bytes, str] = {}
     for name, result in zip(names, loaded, strict=True):
-        extrinsics = b"".join(T.tobytes() for _, T in sorted(result.T_camera_lidar.items()))
+        poses = {**result.T_base_lidar, **result.T_camera_lidar}
+        extrinsics = b"".join(T.tobytes() for _, T in sorted(poses.items()))
         if extrinsics in seen:  # equal to the last bit: a copy
             raise CalibrationError(
                 f"{name}: is the same result as {seen[extrinsics]}; give each once"
@@ -295,8 +344,14 @@ def _names(given: Sequence[Result]) -> list[str]:
 def _require_same_rig(
     first: str, one: Calibration, name: str, two: Calibration, *, own_lenses: bool
 ) -> None:
-    """Check that two results have the same cameras."""
+    """Check that two results have the same cameras and LiDARs."""
     a, b = one.rig.cameras, two.rig.cameras
+    if one.rig.all_lidars != two.rig.all_lidars:
+        raise CalibrationError(
+            f"{name}: has the LiDARs {', '.join(two.rig.all_lidars) or two.rig.lidar}, {first} has "
+            f"{', '.join(one.rig.all_lidars) or one.rig.lidar}, the base first; give results of "
+            "one rig"
+        )
     parts = {"T_camera_lidar", *IMAGE_TIMES}
     parts |= {"intrinsics_px", "distortion"} if own_lenses else set()
     if a.keys() != b.keys():
@@ -320,15 +375,15 @@ def _require_same_rig(
 
 def drift_summary(drift: Drift) -> dict[str, Any]:
     """A comparison as plain values; every key names its unit, every list is x, y, z."""
-    cameras = {
-        name: {
+    cameras = {}
+    for name, entries in drift.cameras.items():
+        axes = _LIDAR_AXES if name in drift.lidars else CAMERA_AXES
+        cameras[name] = {
             "results": {
-                result: each.summary(axes=[CAMERA_AXES[axis] for axis in each.axes])
+                result: each.summary(axes=[axes[axis] for axis in each.axes])
                 for result, each in zip(drift.results, entries, strict=True)
             },
         }
-        for name, entries in drift.cameras.items()
-    }
     lidars = zip(drift.results, drift.lidar, strict=True)
     return {
         "status": drift.status,

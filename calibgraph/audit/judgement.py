@@ -12,7 +12,7 @@ from the scatter of few frames; its stated part, of the error that all frames sh
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -55,6 +55,7 @@ SEARCHES_FARTHER = (
     "if the extrinsic may be off by more than 3 deg or 40 cm, `calibgraph calibrate` searches "
     "farther"
 )
+SINGLE_LIDAR = "; of two LiDARs alone it is not known which has moved"
 SINGLE_CAMERA = "; a single camera cannot be told from the LiDAR: either has moved"
 _TOO_FEW_FRAMES = (
     f"too few frames for an error bar of their own (those of one place count as one): record at "
@@ -67,7 +68,7 @@ def judge_camera(evidence: Evidence, name: str, doubt: str, tolerance: Array) ->
     z_score, covariance = evidence.findings.z_score.get(name), evidence.covariance_of(name)
     if name in evidence.solution.held:
         return CameraAudit("CANNOT TELL", f"{doubt}; {SEARCHES_FARTHER}", z_score=z_score)
-    deviation = _deviation(evidence, name)
+    deviation = deviation_of(evidence, name)
     if covariance is None:
         return CameraAudit("CANNOT TELL", doubt or _NO_ERROR_BAR, deviation, z_score=z_score)
     if has_too_few_frames(evidence, name):
@@ -114,7 +115,7 @@ def _quantiles(evidence: Evidence, name: str, sources: ErrorSources | None) -> A
     return quantiles_in_part(np.repeat(shares, 3), estimated, known)
 
 
-def _deviation(evidence: Evidence, name: str) -> Array:
+def deviation_of(evidence: Evidence, name: str) -> Array:
     """(6,) log of the camera's pose now in its frame as deployed: T_deployed_now = exp(xi)."""
     solved, deployed = evidence.solution.T_camera_lidar, evidence.guess.T_camera_lidar
     return twist_between(deployed[name], solved[name])
@@ -127,6 +128,7 @@ def judge_deviation(
     tolerance: Array,
     *,
     least: Array | float = 0.0,
+    axes: tuple[str, ...] = CAMERA_AXES,
 ) -> tuple[str, str]:
     """The status of a trusted measurement, and its reason.
 
@@ -136,22 +138,23 @@ def judge_deviation(
         quantiles: (2, 6) of its standard deviations, see :func:`student_quantiles`.
         tolerance: (2,) of the turn [rad] and of the shift [m].
         least: (6,) share of sigma that remains however many frames are recorded.
+        axes: (6) their names.
     """
     sigma, (largest, confident) = np.sqrt(np.diag(covariance)), quantiles
     significant = np.abs(deviation) > largest * sigma
     wrong = axes_beyond(deviation, significant, tolerance)
     if wrong.any():
-        return "WRONG", describe_motion(deviation, sigma, wrong, CAMERA_AXES)
+        return "WRONG", describe_motion(deviation, sigma, wrong, axes)
     needed, most = detectable(sigma, confident), np.repeat(tolerance, 3)
     blind = needed > most
     unsure = blind | _may_be_beyond(deviation, covariance, confident, tolerance)
     if unsure.any():
-        found = describe_motion(deviation, sigma, unsure, CAMERA_AXES)
+        found = describe_motion(deviation, sigma, unsure, axes)
         recording_helps = not (least * needed > most).any()
         advice = _advise(needed, blind, recording_helps=recording_helps)
         return "CANNOT TELL", f"may be beyond the tolerance: {found}; {advice}"
     if significant.any():
-        moved = describe_motion(deviation, sigma, significant, CAMERA_AXES)
+        moved = describe_motion(deviation, sigma, significant, axes)
         return "OK", f"within the tolerance, though significant: {moved}"
     return "OK", "no significant deviation, and within the tolerance"
 
@@ -181,22 +184,6 @@ def _advise(needed: Array, blind: Mask, *, recording_helps: bool) -> str:
     return f"{_UNSEEN}: tolerate {enough}, or record more frames, {where}"
 
 
-def judge_lidar(evidence: Evidence, cameras: Mapping[str, CameraAudit]) -> LidarAudit | None:
-    """The motion of the LiDAR, if one explains the deviations of all cameras.
-
-    None where no camera is WRONG, or with a single camera, which cannot be told from the LiDAR.
-    """
-    if evidence.joint_covariance is None:
-        return None
-    return find_lidar_motion(
-        np.concatenate([_deviation(evidence, name) for name in cameras]),
-        evidence.joint_covariance,
-        [evidence.guess.T_camera_lidar[name] for name in cameras],
-        moved=[k for k, each in enumerate(cameras.values()) if each.status == "WRONG"],
-        quantile=float(ndtri(1 - tail_of_axis(len(cameras)))),
-    )
-
-
 def find_lidar_motion(
     deviation: Array,
     covariance: Array,
@@ -206,6 +193,8 @@ def find_lidar_motion(
     quantile: float,
 ) -> LidarAudit | None:
     """The motion of the LiDAR, if one explains the deviations of all cameras; else None.
+
+    A LiDAR beside it is a camera here.
 
     Args:
         deviation: (6 N,) motions of the cameras in their own axes.

@@ -55,8 +55,8 @@ def _reasons(audit: Audit) -> list[Reason]:
     """The findings of the LiDAR and of each camera, the worst first; the same of several is one."""
     alike: dict[tuple[str, str], tuple[str, ...]] = {}
     if audit.lidar is not None:
-        alike["WRONG", f"{audit.lidar.reason}; all cameras agree on it"] = ("LiDAR",)
-    for name, camera in audit.cameras.items():
+        alike["WRONG", audit.lidar_reason] = audit.wrong
+    for name, camera in audit.sensors.items():
         key = camera.status, camera.reason
         alike[key] = (*alike.get(key, ()), name)
     reasons = [Reason(status, names, text) for (status, text), names in alike.items()]
@@ -76,9 +76,8 @@ _COLOURS = {"OK": "green", "CANNOT TELL": "yellow", "WRONG": "red", "CHANGED": "
 
 def print_audit(console: Console, audit: Audit, page: Path | None, elapsed_s: float) -> None:
     """Print the status with its reasons, the deviations per axis, and what was written."""
-    lidar = audit.lidar
-    lines = [f"WRONG LiDAR: {lidar.reason}; all cameras agree on it"] if lidar is not None else []
-    lines += [f"{camera.status} {name}: {camera.reason}" for name, camera in audit.cameras.items()]
+    lines = [f"WRONG {audit.wrong[0]}: {audit.lidar_reason}"] if audit.lidar is not None else []
+    lines += [f"{sensor.status} {name}: {sensor.reason}" for name, sensor in audit.sensors.items()]
     lines += filter(None, (audit.same_recording_note, audit.deployed_verdict_note))
     _print_status(console, audit.status, "check: is the deployed calibration still right?", lines)
     console.print(audit_table(audit))
@@ -122,7 +121,7 @@ def _tolerance(of: Audit | Drift) -> str:
 def audit_table(audit: Audit) -> Table:
     """Three rows per camera: deviation, sigma, smallest detectable change."""
     rows = []
-    for name, camera in audit.cameras.items():
+    for name, camera in audit.sensors.items():
         rows.append([name, "deviation", *twist_cells(camera.deviation, 2, "+z")])
         rows.append(["", "sigma", *twist_cells(camera.sigma, 2)])
         rows.append(["", "detectable", *twist_cells(camera.detectable, 2)])
@@ -131,8 +130,9 @@ def audit_table(audit: Audit) -> Table:
 
 def _drift_lines(drift: Drift) -> list[str]:
     """A line per camera and result, and per LiDAR that stands out; OK ones together."""
+    base, others = ("base LiDAR", "other sensors") if drift.lidars else ("LiDAR", "cameras")
     lines = [
-        f"CHANGED {result}, LiDAR: {lidar.reason}; all cameras agree on it"
+        f"CHANGED {result}, {base}: {lidar.reason}; all {others} agree on it"
         for result, lidar in zip(drift.results, drift.lidar, strict=True)
         if lidar is not None
     ]

@@ -18,7 +18,7 @@ ORDER = ("OK", "CANNOT TELL", "CHANGED", "WRONG")
 
 @dataclass(frozen=True, eq=False)
 class CameraAudit:
-    """A camera's pose, compared with another one of it.
+    """A camera's pose, or that of another LiDAR than the base, compared with another one of it.
 
     Attributes:
         status: OK, CANNOT TELL, or what deviates: WRONG of ``check``, CHANGED of ``drift``.
@@ -85,6 +85,7 @@ class Audit:
         same_recording: whether the deployed calibration was made from these very frames, so that
             errors that they repeat cannot be seen.
         deployed_verdict: of the result that is deployed, when it was made; None of other rigs.
+        lidars: per LiDAR but the base, if there are several; the motion of the base is ``lidar``.
     """
 
     cameras: Mapping[str, CameraAudit]
@@ -98,22 +99,34 @@ class Audit:
     timings_s: Mapping[str, float] = field(default_factory=dict)
     same_recording: bool = False
     deployed_verdict: Status | None = None
+    lidars: Mapping[str, CameraAudit] = field(default_factory=dict)
+
+    @property
+    def sensors(self) -> dict[str, CameraAudit]:
+        """Cameras, and LiDARs but the base."""
+        return {**self.cameras, **self.lidars}
 
     @property
     def status(self) -> str:
-        """The worst of the cameras."""
-        return max((camera.status for camera in self.cameras.values()), key=ORDER.index)
+        """The worst of the sensors."""
+        return max((sensor.status for sensor in self.sensors.values()), key=ORDER.index)
 
     @property
     def wrong(self) -> tuple[str, ...]:
-        """The names that are WRONG: the LiDAR alone, or cameras."""
+        """The names that are WRONG: the LiDAR alone, of several the base; or other sensors."""
         if self.lidar is not None:
-            return ("LiDAR",)
+            return (self.deployed.lidar if self.lidars else "LiDAR",)
         return self.with_status("WRONG")
 
+    @property
+    def lidar_reason(self) -> str:
+        """How the LiDAR moved, in a sentence; empty if it did not."""
+        agree = "all other sensors agree" if self.lidars else "all cameras agree"
+        return "" if self.lidar is None else f"{self.lidar.reason}; {agree} on it"
+
     def with_status(self, status: str) -> tuple[str, ...]:
-        """The names of cameras."""
-        return tuple(name for name, camera in self.cameras.items() if camera.status == status)
+        """The names of sensors."""
+        return tuple(name for name, sensor in self.sensors.items() if sensor.status == status)
 
     @property
     def same_recording_note(self) -> str:
@@ -150,6 +163,7 @@ def audit_summary(audit: Audit) -> dict[str, Any]:
             name: camera.summary(z_score=camera.z_score) for name, camera in audit.cameras.items()
         },
         "lidar": None if audit.lidar is None else lidar_summary(audit.lidar),
+        "lidars": {name: lidar.summary() for name, lidar in audit.lidars.items()},
         "timings_s": dict(audit.timings_s),
     }
 

@@ -29,8 +29,8 @@ def check(
 ) -> None:
     """Is a deployed calibration still right? Exit 0: all OK, 1: WRONG, 3: the data cannot tell.
 
-    Compares it with images and clouds of a recent recording, per camera and axis. Writes no file
-    but the page, if one is wanted.
+    Compares it with images and clouds of a recent recording, per camera, LiDAR and axis. Writes no
+    file but the page, if one is wanted.
     """
     from calibgraph.audit import check
     from calibgraph.audit.judgement import tolerance_twist
@@ -75,8 +75,8 @@ def drift(
 ) -> None:
     """Which of several results of one rig deviates? Exit 0: none, 1: one CHANGED, 3: cannot tell.
 
-    Compares each result with the others that agree, per camera and axis, without a reference: of
-    several days, or of several vehicles. One false alarm in 100 calls.
+    Compares each result with the others that agree, per camera, LiDAR and axis, without a
+    reference: of several days, or of several vehicles. One false alarm in 100 calls.
     """
     from calibgraph.audit import drift
 

@@ -31,9 +31,6 @@ def report(
         None, metavar="FILE.html", help="Page. (default: report.html beside, or none with --mcap)"
     ),
     mcap: Path | None = Option(None, metavar="FILE.mcap", help="Recording for Foxglove or Rerun."),
-    dataset: list[Path] | None = Option(
-        None, metavar="DATASET", help="Where images and clouds are now; repeat it in their order."
-    ),
     force: options.Force = False,
 ) -> None:
     """Show a result: as one HTML page that opens without a network, or as a recording.
@@ -42,17 +39,13 @@ def report(
     """
     from calibgraph.files import require_new_file
     from calibgraph.io.calibrations import load_calibration
-    from calibgraph.io.dataset import load_dataset
     from calibgraph.model.result_files import REPORT_FILE
-    from calibgraph.report.html import relocate_frames, write_report
+    from calibgraph.report.html import write_report
 
     for path, suffixes in ((out, _PAGES), (mcap, (".mcap",))):
         if path is not None:
             require_new_file(path, *suffixes, force=force)
     loaded, written = load_calibration(result), []
-    if dataset:
-        with checked_arguments():
-            loaded = relocate_frames(loaded, load_dataset(dataset, loaded.rig))
     if out is not None or mcap is None:
         folder = result if result.is_dir() else result.parent
         written.append(write_report(loaded, out or folder / REPORT_FILE))
@@ -128,8 +121,7 @@ def doctor(
 ) -> None:
     """Examine a dataset before it is calibrated: what is there, what to fix; exit 1 if anything."""
     from calibgraph.doctor import diagnose
-    from calibgraph.file_sets import require_own_folder
-    from calibgraph.files import write_text
+    from calibgraph.files import require_own_folder, write_text
     from calibgraph.io.rigs import load_rig
 
     if out is not None:
@@ -272,7 +264,7 @@ def _parse_pose(text: str) -> NDArray[np.float64]:
 
 
 STREET = "street"
-RIG, BEAMS, STEP_M = "kitti", 64, 4.0  # defaults of simulate_street, but for the rig
+RIG, BEAMS = "kitti", 64  # defaults of simulate_street, but for the rig
 _PANEL = "Scenario street"
 
 
@@ -302,15 +294,6 @@ def simulate(
         rich_help_panel=_PANEL,
         help=f"Of the LiDAR. (default: {BEAMS})",
     ),
-    step_m: float | None = Option(
-        None, rich_help_panel=_PANEL, help=f"Mean distance between frames. (default: {STEP_M:g})"
-    ),
-    sensor_errors: float | None = Option(
-        None, rich_help_panel=_PANEL, help="Of the LiDAR: 1 for those of real ones. (default: 0)"
-    ),
-    vary_layout: bool = Option(
-        False, "--vary-layout", rich_help_panel=_PANEL, help="Draw the street's layout by the seed."
-    ),
 ) -> None:
     """Simulate data with a known truth, reference.yaml, and a displaced guess, rig.yaml."""
     from calibgraph.io.rigs import load_rig
@@ -321,11 +304,8 @@ def simulate(
     common: dict[str, Any] = {
         "frames": frames, "rotation_deg": rotation_deg, "translation_m": translation_m, "seed": seed
     }  # fmt: skip
-    of_street: dict[str, Any] = {
-        "rig": rig, "beams": beams, "step_m": step_m, "sensor_errors": sensor_errors,
-        "vary_layout": vary_layout or None,
-    }  # fmt: skip
-    street = {name: value for name, value in of_street.items() if value is not None}
+    given: dict[str, Any] = {"rig": rig, "beams": beams}
+    street = {name: value for name, value in given.items() if value is not None}
     with progress_bar() as progress, checked_arguments():
         if scenario == STREET:
             name = street.pop("rig", RIG)

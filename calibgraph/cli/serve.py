@@ -137,7 +137,7 @@ def pick(
 
     The server answers this machine only. Ends with Ctrl-C; every change is saved at once.
     """
-    from calibgraph.file_sets import require_own_folder
+    from calibgraph.files import require_own_folder
     from calibgraph.io.rigs import REFERENCE_FILE
     from calibgraph.pick.estimate import SESSION_FILE
     from calibgraph.pick.server import TABLE_FILE, PickServer, Workspace

@@ -18,8 +18,7 @@ import pyarrow as pa
 from pyarrow import parquet
 
 from calibgraph.errors import CalibrationError, FileError, needs_extra
-from calibgraph.file_sets import require_own_folder
-from calibgraph.files import require_place_for_folder, sha256, write_bytes
+from calibgraph.files import require_own_folder, require_place_for_folder, sha256, write_bytes
 
 _CHANGES = (
     "ETag", "etag", "generation", "md5Hash", "crc32c", "CRC", "size", "mtime", "LastModified",

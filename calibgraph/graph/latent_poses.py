@@ -308,9 +308,11 @@ def _distortion_graph(parts: VarianceComponents) -> gtsam.NonlinearFactorGraph:
     graph, size = gtsam.NonlinearFactorGraph(), parts.distortion_jacobian.shape[2]
     noise = gtsam.noiseModel.Diagonal.Variances(np.broadcast_to(parts.distortion_size, size))
     graph.add(gtsam.PriorFactorVector(DISTORTION, np.zeros(size), noise))
-    zero, quadratic = gtsam.Values(), (parts.distortion_information, parts.distortion_vector)
+    information, vector = parts.distortion_information, parts.distortion_vector
+    zero, least = gtsam.Values(), float(vector @ np.linalg.pinv(information) @ vector)
     zero.insert(DISTORTION, np.zeros(size))
-    shown = gtsam.HessianFactor(DISTORTION, *quadratic, 0.0)
+    # With this constant no error is negative, at which an optimizer would stop.
+    shown = gtsam.HessianFactor(DISTORTION, information, vector, least)
     graph.add(gtsam.LinearContainerFactor(shown, zero))
     return graph
 

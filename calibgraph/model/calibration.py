@@ -16,8 +16,7 @@ import gtsam
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.file_sets import written_together
-from calibgraph.files import sha256, write_yaml
+from calibgraph.files import sha256, write_yaml, written_together
 from calibgraph.model import geometry, result_files
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config, Terms

@@ -20,7 +20,7 @@ LensPart = Literal["focal", "centre", "distortion", "offset", "readout"]
 
 Pixels = Annotated[float, Field(ge=1e-6, le=1e6)]
 Weight = Annotated[float, Field(ge=0, le=1e12)]
-Cells = Annotated[int, Field(gt=0, le=100_000)]
+Cells = Annotated[int, Field(gt=0, le=1000)]
 Seed = Annotated[int, Field(ge=0, lt=2**31)]
 
 

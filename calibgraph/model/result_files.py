@@ -5,8 +5,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from calibgraph.errors import FileError
-from calibgraph.file_sets import require_own_folder
-from calibgraph.files import sha256
+from calibgraph.files import require_own_folder, sha256
 
 CALIBRATION_FORMAT = "calibgraph-calibration/1"
 CALIBRATION_FILE = "calibration.yaml"
@@ -34,7 +33,7 @@ def require_result_folder(folder: Path, read: Iterable[Path] = ()) -> None:
     """Check, before hours of work, that a result may be written into a folder.
 
     Raises:
-        FileError: as of :func:`calibgraph.file_sets.require_own_folder`, if a file that would be
+        FileError: as of :func:`calibgraph.files.require_own_folder`, if a file that would be
             replaced is read, or as of :func:`require_own_tables`.
     """
     read = [path for path in read if path.exists()]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -57,11 +57,3 @@ def to_data_uri(figure: Figure) -> str:
     small = rgb.quantize(_PALETTE_SIZE, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
     small.save(buffer, "PNG")
     return f"data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode('ascii')}"
-
-
-def add_legend(axes: Axes, **where: Any) -> None:
-    """Add a legend and a light grid."""
-    axes.grid(color="0.92", linewidth=0.8)
-    axes.set_axisbelow(True)
-    style = {"loc": "upper right", "markerscale": 3, "framealpha": 0.85, **where}
-    axes.legend(fontsize=8, borderpad=0.3, handlelength=1.4, **style)

@@ -2,8 +2,6 @@
 
 import os
 import shlex
-from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +10,10 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from calibgraph.arrays import Array
-from calibgraph.errors import DatasetError
-from calibgraph.file_sets import written_together
-from calibgraph.files import write_text
+from calibgraph.files import write_text, written_together
 from calibgraph.io.dataset import Dataset
 from calibgraph.io.formats import EXPORT_FORMATS
-from calibgraph.io.frame import Frame, frame_of_entry, hash_source
+from calibgraph.io.frame import frame_of_entry
 from calibgraph.model.calibration import FRAMES_SENTENCE, TANGENT_SENTENCE, Calibration
 from calibgraph.model.geometry import degrees_and_centimetres, invert, point_in_lidar
 from calibgraph.model.metrics import pose_error
@@ -80,6 +76,7 @@ def render_page(result: Calibration) -> str:
             "overlays": overlays.get(name),
             "diagrams": camera_diagrams(result, name, errors.get(name)),
             "worked": worked_point(camera, errors.get(name)),
+            "rounds": [cameras[name] for cameras in result.rounds if name in cameras],
         }
         for index, (name, camera) in enumerate(rig.cameras.items())
     ]
@@ -254,16 +251,10 @@ def pose_text(T: Array) -> str:
 def camera_diagrams(
     result: Calibration, name: str, errors: ReprojectionErrors | None
 ) -> dict[str, str]:
-    """Residuals, coverage and convergence of a camera, as data URIs by name."""
-    found, camera = dict[str, str](), result.rig.cameras[name]
-    if errors is not None:
-        found["residuals"] = plots.residual_scatter(errors, result.residuals[name].sigma_px)
-        found["over_image"] = plots.residual_map(camera, errors)
-        found["coverage"] = plots.coverage(camera, errors)
-    rounds = [cameras[name] for cameras in result.rounds if name in cameras]
-    if len(rounds) > 1:
-        found["convergence"] = plots.convergence(rounds)
-    return found
+    """Residuals over the image, and its coverage, as data URIs by name."""
+    camera = result.rig.cameras[name]
+    drawn = {"over_image": plots.residual_map, "coverage": plots.coverage}
+    return {} if errors is None else {key: draw(camera, errors) for key, draw in drawn.items()}
 
 
 def recording_name(result: Calibration) -> str:
@@ -272,46 +263,3 @@ def recording_name(result: Calibration) -> str:
         return Path(next(iter(result.inputs), "")).name
     found = {os.path.commonpath([e["cloud"], *e["images"].values()]) for e in result.frames}
     return ", ".join("/".join(Path(each).parts[-2:]) for each in sorted(found))
-
-
-def relocate_frames(result: Calibration, dataset: Dataset) -> Calibration:
-    """The result with the paths of its images and clouds taken from a dataset that has moved.
-
-    Args:
-        result: of ``calibrate``, or of a table whose frame numbers are those of the dataset.
-        dataset: the same folders in the same order.
-
-    Raises:
-        DatasetError: if the dataset does not have the result's frames, or other images or clouds
-            under their names.
-    """
-    available = {frame.index: frame for frame in dataset.frames}
-    # Where only correspondences have the number, no name is known.
-    names: dict[int, str | None] = {entry["frame"]: entry["name"] for entry in result.frames}
-    if not names and result.correspondences is not None:
-        names = dict.fromkeys(np.unique(result.correspondences.frame).tolist())
-    for number, name in names.items():
-        if number not in available or name not in (None, available[number].name):
-            raise DatasetError(
-                f"{', '.join(map(str, dataset.folders))}: has no frame number {number}"
-                f"{'' if name is None else f' named {name!r}'}, which the result was made from; "
-                "give the same folders in the same order",
-                frame=number,
-            )
-    for entry in result.frames:
-        _require_same_files(result, entry, available[entry["frame"]])
-    return replace(result, frames=tuple(available[number].entry() for number in names))
-
-
-def _require_same_files(result: Calibration, entry: Mapping[str, Any], frame: Frame) -> None:
-    """Check that a frame's cloud and images are those that the result was made from."""
-    before = {"cloud": entry["cloud"], **entry["images"]}
-    now = {"cloud": frame.cloud_path, **frame.image_paths}
-    for what in before.keys() & now.keys():
-        recorded = result.inputs.get(before[what])
-        if recorded is not None and recorded != hash_source(now[what]):
-            raise DatasetError(
-                f"{now[what]}: is not what the result was made from ({before[what]}): it has "
-                "another content; give the same recording",
-                frame=frame.index,
-            )

@@ -52,8 +52,8 @@ def write_mcap(result: Calibration, path: Path | str, *, progress: Progress = no
     """
     if not result.frames:
         raise CalibrationError(
-            "the result names no images and clouds, as that of a table; give those that the table "
-            "was made from with --dataset"
+            "the result names no images and clouds, as that of a table; give a result that "
+            "was made from them"
         )
     path, context, opened = Path(path), foxglove.Context(), dict[str, Any]()
 

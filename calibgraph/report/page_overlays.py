@@ -33,7 +33,7 @@ def draw_overlays(
         Per camera its pictures; the reason why the others are missing, None if none are.
     """
     drawn = dict[str, tuple[str, ...]]()
-    budget = _PICTURES_BYTES // (2 * len(cameras))
+    budget = _PICTURES_BYTES // (2 * max(len(cameras), 1))
     try:
         cloud = frame.load_cloud()[:, :3].astype(np.float64)
         for name, several in cameras.items():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -12,12 +11,7 @@ from numpy.typing import NDArray
 from calibgraph.arrays import Array
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.geometry import to_T_lidar_camera
-from calibgraph.report.figure import (
-    add_legend,
-    image_figure,
-    new_figure,
-    to_data_uri,
-)
+from calibgraph.report.figure import image_figure, to_data_uri
 from calibgraph.solver.matches import CameraBlock, camera_blocks
 from calibgraph.solver.preprocess import preprocess
 
@@ -26,36 +20,12 @@ if TYPE_CHECKING:
 
 
 # Colours that the colour-blind can tell apart (Okabe and Ito, "Color universal design").
-_INLIER, _OUTLIER, _LINE = "#0072B2", "#D55E00", "#000000"
+_INLIER, _OUTLIER = "#0072B2", "#D55E00"
 
 _MAX_DOTS = 6000
-_MAX_GATES = 2.0  # axes of residuals end here
 ARROW_COLUMNS = 12  # cells across the image
 _COVERAGE_COLUMNS = 20
 _ROUND_FACTORS = np.array([1.0, 2.0, 5.0, 10.0])
-_MIN_MOVE = 1e-4  # deg or cm: zero on a logarithmic axis
-
-
-def residual_scatter(errors: ReprojectionErrors, sigma_px: float) -> str:
-    """Residuals in u and v, with the gate and one sigma."""
-    figure = new_figure(3.3)
-    axes = figure.add_axes((0.13, 0.15, 0.57, 0.76))  # a square; the legend is beside it
-    limit = _MAX_GATES * errors.gate_px
-    for part, colour, label in _outliers_and_inliers(errors):
-        dots = _thin(part.vectors_px)
-        axes.plot(*dots.T, ".", color=colour, markersize=2.5, alpha=0.5, label=label)
-    for radius, style, label in (
-        (errors.gate_px, "-", f"gate\n{errors.gate_px:.2g} px"),
-        (sigma_px, "--", f"1 sigma\n{sigma_px:.2g} px"),
-    ):
-        circle = radius * np.exp(1j * np.linspace(0, 2 * np.pi, 200))
-        axes.plot(circle.real, circle.imag, style, color=_LINE, linewidth=1.2, label=label)
-    axes.set(xlim=(-limit, limit), ylim=(limit, -limit), aspect="equal")
-    axes.set(xlabel="du [px] (right)", ylabel="dv [px] (down)")
-    far = int(np.count_nonzero(np.abs(errors.vectors_px).max(axis=1, initial=0.0) > limit))
-    axes.set_title(f"{far} of {len(errors.frame)} are farther out than shown", fontsize=9)
-    add_legend(axes, loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    return to_data_uri(figure)
 
 
 def residual_map(camera: Camera, errors: ReprojectionErrors) -> str:
@@ -93,44 +63,6 @@ def coverage(camera: Camera, errors: ReprojectionErrors) -> str:
     whole = MaxNLocator(4, integer=True)
     figure.colorbar(image, cax=beside, ticks=whole).ax.tick_params(labelsize=8)
     return to_data_uri(figure)
-
-
-def convergence(rounds: Sequence[Mapping[str, Any]]) -> str:
-    """Change of the extrinsic in each round of matching, and its number of matches."""
-    from matplotlib.ticker import NullLocator
-
-    figure = new_figure(3.1)
-    moved = figure.add_axes((0.15, 0.46, 0.82, 0.45))
-    matches = figure.add_axes((0.15, 0.14, 0.82, 0.24), sharex=moved)
-    numbers = np.arange(1, len(rounds) + 1)
-    for key, style, colour, label in (
-        ("moved_deg", "o-", _INLIER, "turned [deg]"),
-        ("moved_cm", "s--", _OUTLIER, "shifted [cm]"),
-    ):
-        values = np.maximum([r[key] for r in rounds], _MIN_MOVE)
-        moved.plot(numbers, values, style, color=colour, markersize=4, label=label)
-    moved.set_yscale("log")
-    moved.yaxis.set_minor_locator(NullLocator())
-    moved.yaxis.set_major_formatter("{x:g}")  # in place of powers, which take long to draw
-    moved.tick_params(labelbottom=False)
-    # Above the axes: inside, it would cover points.
-    add_legend(moved, markerscale=1, loc="lower center", bbox_to_anchor=(0.5, 0.99), ncols=2)
-    matches.bar(numbers, [r["matches"] for r in rounds], color="0.6", width=0.6)
-    matches.set(xlabel="round of matching", ylabel="matches")
-    matches.set_xticks(numbers)
-    figure.align_ylabels()
-    return to_data_uri(figure)
-
-
-def _outliers_and_inliers(
-    errors: ReprojectionErrors,
-) -> tuple[tuple[ReprojectionErrors, str, str], ...]:
-    """The matches beyond the gate and those within it, with colour and label."""
-    outside, inside = errors.select(~errors.is_inlier), errors.select(errors.is_inlier)
-    return (
-        (outside, _OUTLIER, f"{len(outside.frame)} beyond"),
-        (inside, _INLIER, f"{len(inside.frame)} inside"),
-    )
 
 
 def _thin(dots: Array) -> Array:

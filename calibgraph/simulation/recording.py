@@ -9,8 +9,7 @@ import cv2
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.file_sets import require_own_folder, written_together
-from calibgraph.files import write_atomically, write_bytes
+from calibgraph.files import require_own_folder, write_atomically, write_bytes, written_together
 from calibgraph.io.rigs import REFERENCE_FILE, RIG_FILE
 from calibgraph.model.geometry import relative_transform
 from calibgraph.model.metrics import perturb

@@ -3,7 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
-from calibgraph.file_sets import require_own_folder
+from calibgraph.files import require_own_folder
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.metrics import perturb
 from calibgraph.simulation.correspondences import (

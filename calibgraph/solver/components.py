@@ -46,15 +46,10 @@ def estimate_variance_ratios(linear: Linearization, present: VarianceRatios) -> 
         linear: with the present ratios.
         present: the ratios of its model.
     """
-    evidence, places = squared_displacements(linear), linear.model.places
-    least = ratios_by_evidence(evidence, places=places, present=present)
-    without = {name: one._replace(free=0.0) for name, one in evidence.items()}
-    most = ratios_by_evidence(without, places=places, present=present)
-    if least.is_near(present) and most.is_near(present):  # whatever the data leave open
-        return most
+    evidence = squared_displacements(linear)
     for name, t in undetermined(linear).items():
         evidence[name] = evidence[name]._replace(free=evidence[name].free - t)
-    return ratios_by_evidence(evidence, places=places, present=present)
+    return ratios_by_evidence(evidence, places=linear.model.places, present=present)
 
 
 def ratios_by_evidence(

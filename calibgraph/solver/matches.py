@@ -19,7 +19,6 @@ from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import to_T_lidar_camera
 from calibgraph.model.rig import Camera, Rig
-from calibgraph.solver.preprocess import hash_numbers
 from calibgraph.solver.robust import (
     IDENTITY,
     MIN_SIGMA_PX,
@@ -84,11 +83,6 @@ class CameraBlock:
     def frame_counts(self) -> NDArray[np.int64]:
         """(f,) of the correspondences of each frame."""
         return self.frame_edges[1:] - self.frame_edges[:-1]
-
-    @cached_property
-    def point_hashes(self) -> list[int]:
-        """(n,) of the bits of each point."""
-        return hash_numbers(self.block.points_lidar_m)
 
     def sorted_by(self, of_frame: NDArray[np.int64]) -> CameraBlock:
         """The same correspondences in the order of a number of their frames, (f,)."""

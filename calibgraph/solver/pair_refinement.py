@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
@@ -30,10 +30,10 @@ from calibgraph.solver.pnp import DAMPING
 from calibgraph.solver.two_pass import Objective, Optimum
 from factors import pose_sigmas
 
-_NARROWINGS = 4  # steps at most from the spread at the estimate to the least one, by half each
+_NARROWINGS = 3  # steps at most from the spread at the estimate to the least one, by half each
 _COARSE = 1e-6  # relative change of the error at which each of them stops
 _MAX_STEPS, _MAX_STEP, _CONVERGED = 30, 0.1, 1e-5  # of a pair alone: rad, m
-_SETTLED = 0.005  # relative change of a spread, from which on it is not measured again
+_SETTLED, _MOST = 0.005, 9  # relative change of a spread that ends its measuring, and its steps
 Places = Mapping[frozenset[str], Mapping[str, Array]]
 _HELD_RAD, _HELD_M = np.radians(1.0), 0.2  # of the first camera, while its pair is fitted alone
 
@@ -65,11 +65,11 @@ def refine_with_pairs(
     for step in range(steps):
         now = now if step == 0 else np.array([term.sigma_px(T) for term in terms])
         sigmas = least * np.maximum(now / least, 1.0) ** (1.0 - (step + 1) / steps)
-        scaled = tuple(t.with_sigma(s) for t, s in zip(terms, sigmas.tolist(), strict=True))
-        near = replace(inliers, pairs=scaled)
+        scaled = [t.with_sigma(s) for t, s in zip(terms, sigmas.tolist(), strict=True)]
+        near = inliers.with_pairs(scaled)
         T = near.minimize(T, at.scales, tolerance=_COARSE).T_camera_lidar
-    kept = tuple(t.without_outliers(T, s) for t, s in zip(scaled, sigmas.tolist(), strict=True))
-    joined = replace(inliers, pairs=kept)
+    kept = [t.without_outliers(T, s) for t, s in zip(scaled, sigmas.tolist(), strict=True)]
+    joined = inliers.with_pairs(kept)
     return joined, joined.minimize(T, at.scales)
 
 
@@ -117,11 +117,11 @@ def fit_pair(
     T, held = np.stack([(near or start)[name] for name in names]), np.linalg.pinv(covariance_a)
     prior, rows = np.zeros((12, 12)), [rows_of_pair(names, term) for term in terms]
     prior[:6, :6], sigmas, stands = held, np.zeros(len(terms)), False
-    for _ in range(_MAX_STEPS):
+    for number in range(_MAX_STEPS):
         now, data, gradient = dict(zip(names, T, strict=True)), np.zeros((12, 12)), np.zeros(12)
         if not stands:
             before, sigmas = sigmas, np.array([term.sigma_px(now) for term in terms])
-            stands = bool((np.abs(sigmas - before) <= _SETTLED * sigmas).all())
+            stands = number > _MOST or bool((np.abs(sigmas - before) <= _SETTLED * sigmas).all())
             scaled = [t.with_sigma(s) for t, s in zip(terms, sigmas.tolist(), strict=True)]
         for own, term in zip(rows, scaled, strict=True):
             sums = term.sums(now)

@@ -26,7 +26,6 @@ from typing import NamedTuple
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.graph.components import VarianceRatios
@@ -51,12 +50,12 @@ from calibgraph.model.geometry import (
 from calibgraph.model.pose_kernel import logarithms
 from calibgraph.solver.two_pass import MAX_ITERATIONS
 from factors import BlockSums
-from factors.conditioning import SINGULAR, unit_diagonal
+from factors.conditioning import unit_diagonal
 
 TOLERANCE = 1e-6
 """Relative change of the cost at which it stops: some 1e-3 of the smallest standard deviations."""
 
-_ROUNDING = 3e-15  # smallest part of a sum that a difference may leave
+_FREE = 1e3  # rad and m: a standard deviation that no correspondences have
 _SHARES = 0.5 ** np.arange(12)
 """Of a step: the first that descends; mostly the whole step."""
 
@@ -341,31 +340,14 @@ class Linearization:
         return None
 
     def is_determined(self) -> bool:
-        """Whether every direction of every camera is, but for rounding noise."""
+        """Whether every direction of every camera is: of a free one rounding leaves far more."""
         if not {*self.model.camera_keys} <= {*self.model.shared_graph.keyVector()}:
             return False  # nothing acts on a camera
-        whole, at = self.hessian(), self.model.columns_of(self.model.reported_keys)
-        if not (np.isfinite(whole).all() and (np.diag(whole) > 0).all()):
-            return False
         try:
-            left, own = _left_information(whole, at), self.joint_covariance[at, at]
+            variances = np.diag(self.covariance_of(self.model.reported_keys))
         except np.linalg.LinAlgError:
             return False
-        if np.diag(left).min() <= 0 or own.min() <= 0:
-            return False
-        values = np.linalg.eigvalsh(unit_diagonal(left)[0])
-        before = np.sqrt(np.diag(self.shared_hessian[0])[at])
-        share = np.linalg.eigvalsh(left / np.outer(before, before))[0]
-        return bool(values[0] > SINGULAR * values[-1] and share > _ROUNDING)
-
-
-def _left_information(hessian: Array, rows: NDArray[np.intp]) -> Array:
-    """(r, r) of some unknowns, the others eliminated."""
-    scaled, units = unit_diagonal(hessian)
-    others = np.delete(np.arange(len(hessian)), rows)
-    across = np.linalg.solve(scaled[np.ix_(others, others)], scaled[np.ix_(others, rows)])
-    left = scaled[np.ix_(rows, rows)] - scaled[np.ix_(rows, others)] @ across
-    return np.asarray(left * np.outer(units[rows], units[rows]))
+        return bool(((variances > 0) & (variances < _FREE**2)).all())
 
 
 def _soften(

@@ -177,9 +177,6 @@ def within_cap(
     return np.flatnonzero(rank < config.matches_max)
 
 
-_MOST_CELLS = 1 << 20  # 8 MB of places; of more cells, those that are taken are numbered
-
-
 def best_in_cell(
     rig: Rig,
     table: Correspondences,
@@ -208,9 +205,6 @@ def best_in_cell(
     among = np.ones(len(table), dtype=np.bool_) if among is None else among
     cell, cells = np.empty(len(table), np.int64), config.grid_columns * config.grid_rows
     _number_cells(camera, table.pixels_px, sizes, shape, cell)
-    if cells > _MOST_CELLS:
-        taken, cell = np.unique(cell, return_inverse=True)
-        cells = len(taken)
     if _are_sorted(camera, table.frame):
         edges = frame_edges(camera, table.frame)
         return np.flatnonzero(_best_of_runs(edges, cells, cell, table.confidence, among))
@@ -347,12 +341,6 @@ def _first_of_same_content(hashes: Hashes, counts: Numbers) -> Numbers:
     for one, other in pairs[alike]:
         found[other] = min(found[other], found[one])
     return found
-
-
-def hash_numbers(points_lidar_m: Array) -> list[int]:
-    """:func:`point_hashes` as numbers: a set of some hundred is faster than arrays."""
-    numbers: list[int] = point_hashes(points_lidar_m).tolist()
-    return numbers
 
 
 def point_hashes(points: Array) -> Hashes:

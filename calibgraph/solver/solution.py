@@ -41,10 +41,6 @@ from calibgraph.solver.pairs import PairTerm, pair_terms
 from calibgraph.solver.places import ErrorFit
 from calibgraph.solver.sources import predict_variances, sources_by_camera, variances_by_source
 from calibgraph.solver.two_pass import Objective, Optimum, Scales, Transforms
-from factors import pose_sigmas
-
-_HELD_SIGMAS = pose_sigmas(rotation_rad=np.radians(0.1), translation_m=0.02)
-"""Of a camera that a pair is fitted to, if its covariance is unknown."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,10 +182,11 @@ class Solution:
         """The relative poses of pairs by images, the first camera held near its correspondences."""
         if self.alone is not None:
             return self.alone.pair_fits
-        count, prior = len(self.fitted.cameras), _HELD_SIGMAS**2
-        joint = np.diag(np.tile(prior, count)) if self.covariance is None else self.covariance
-        held = [joint[pose_rows(number), pose_rows(number)] for number in range(count)]
-        return fit_pairs(self.pair_terms, self.T_camera_lidar, np.array(held), self.pairs_alone)
+        if (joint := self.covariance) is None:
+            return []
+        rows = map(pose_rows, range(len(self.fitted.cameras)))
+        held = np.array([joint[own, own] for own in rows])
+        return fit_pairs(self.pair_terms, self.T_camera_lidar, held, self.pairs_alone)
 
     @cached_property
     def conflicts(self) -> tuple[Conflict, ...]:

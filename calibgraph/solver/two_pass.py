@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -169,6 +170,18 @@ class Objective:
             for name, (block, T, scale) in self.gated.items()
         }
 
+    def with_pairs(self, pairs: Sequence[PairTerm]) -> Objective:
+        """The same objective with what cameras see in common."""
+        other = self._with(pairs=tuple(pairs))
+        other.__dict__["gate_hessian"] = self.gate_hessian
+        return other
+
+    def _with(self, **fields: Any) -> Objective:
+        """With other fields, on which the terms between poses do not depend."""
+        other = replace(self, **fields)
+        other.__dict__["pose_graph"] = self.pose_graph
+        return other
+
     def data_only(self) -> Objective:
         """The reprojection term alone, of the cameras that have correspondences."""
         rig = Rig(cameras={name: self.rig.cameras[name] for name in self.blocks})
@@ -292,9 +305,7 @@ class Objective:
                     camera=name,
                 )
         gated = {n: (block, T_camera_lidar[n], scales[n]) for n, block in self.blocks.items()}
-        other = replace(self, blocks=inliers, gated=gated)
-        other.__dict__["pose_graph"] = self.pose_graph  # the same terms between poses
-        return other
+        return self._with(blocks=inliers, gated=gated)
 
 
 def best_start(

@@ -29,17 +29,21 @@ _LAST_FRAMES = 20  # of which it is kept whether they agree with the estimate
 _ABSORBED = np.array([[name == one for one in ("given", "used", "absorbed")] for name in COUNTS])
 _UNUSUAL = 25.0  # squared sigmas of a six-vector
 _TOTAL_KEPT = 1 - 1 / 2000  # of the total scatter, from frame to frame
-_TRY_AGAIN = 1.5  # growth of the number of frames from attempt to attempt to start
 
 
 def begin_frames(state: State, frames: Sequence[StreamFrame]) -> None:
     """Begin frames, none of whose matches is absorbed."""
     last, n = frames[-1], len(state.names)
-    found = [one.table.findings for one in frames if len(one.table)][-1:]
+    tables = [one.table for one in frames if len(one.table)][-1:]
     state.frame, state.stamp_ns = last.frame, last.stamp_ns
     state.updates += len(frames)
-    if found and found[0] != state.findings and (new := findings_of(found[0])) != state.findings:
-        state.findings = new
+    for table in tables:
+        state.knows_motion = table.twist_per_s is not None
+        if (
+            table.findings != state.findings
+            and (new := findings_of(table.findings)) != state.findings
+        ):
+            state.findings = new
     numbers = np.array([one.frame for one in frames], dtype=np.int64)
     state.numbers = np.concatenate([state.numbers, numbers])
     state.at = (*state.at, *(str(one.place) for one in frames))
@@ -228,7 +232,7 @@ def _try_to_start(state: State, camera: int, table: Correspondences) -> None:
     waiting = (*state.waiting[camera], own)
     count, waiting = len(waiting), waiting[-HISTORY:]
     state.put(camera, waiting=waiting)
-    if not _is_attempt_due(count, state.config.tracking.start_frames):
+    if count % min(state.config.tracking.start_frames, HISTORY):
         return
     rig = Rig(lidar=state.rig.lidar, cameras={name: state.rig.cameras[name]})
     try:
@@ -240,12 +244,6 @@ def _try_to_start(state: State, camera: int, table: Correspondences) -> None:
         _wait_longer(state, camera, result.camera_verdicts[name].reasons)
         return
     _start_camera(state, camera, result.T_camera_lidar[name])
-
-
-def _is_attempt_due(frames: int, first: int) -> bool:
-    """At the first frames, then at growing intervals, then with every new window of frames."""
-    attempts = first * _TRY_AGAIN ** np.arange(10)
-    return frames in attempts.astype(int) or frames >= HISTORY
 
 
 def _wait_longer(state: State, camera: int, reasons: tuple[str, ...]) -> None:
@@ -266,26 +264,52 @@ def _start_camera(state: State, camera: int, T_camera_lidar: Array) -> None:
         started=True, waiting=(), refused=(), references=T_camera_lidar,
         scales=scale, share=gated.usual_share, curvature=gated.curvature(scale),
     )  # fmt: skip
-    consider_lens(state, camera, raw)
+    _consider_lens(state, camera, raw.select(gated.inliers))
     absorb_again(state, camera, usable, T_camera_lidar)
 
 
-def consider_lens(state: State, camera: int, matches: CameraBlock) -> Array:
+def count_epoch(state: State, camera: int, first: int) -> None:
+    """Count what a camera's matches since a frame show of its lens, and of the scan distortion."""
+    own = state.matches_of(camera)
+    if own is None:
+        return
+    recent = own[0].select(own[1] & (own[0].frame >= first))
+    if len(recent):
+        bends = state.bends[camera] + _bends_of(state, camera, recent)
+        state.put(camera, lens=_consider_lens(state, camera, recent), bends=bends)
+
+
+def _consider_lens(state: State, camera: int, matches: CameraBlock) -> Array:
     """What may err of a camera's lens, by some matches and closed epochs; (6, 6 + k) of both."""
     of, T = state.rig.cameras[state.names[camera]], state.references[camera]
-    before, inliers = state.lens[camera], matches.within_gate(T, state.scales[camera].gate_px)
-    if not inliers.any():
-        return before
-    block = matches.select(inliers).with_scale(state.scales[camera])
+    block, before = matches.with_scale(state.scales[camera]), state.lens[camera]
     lens = considered_lens(of, block)
     columns = lens_columns(lens, block, T)
     if before.shape == columns.shape:  # else motion became known, or none yet
         columns = columns + before
     kept = state.matches_of(camera)  # in more directions than those of one epoch
-    seen = block if kept is None else kept[0].with_scale(state.scales[camera]).select(kept[1])
+    seen = block if kept is None else kept[0].select(kept[1]).with_scale(state.scales[camera])
     found = error_by_lens(lens, columns, seen, T, of=state.config.of)
     state.put(camera, lens_errors=np.zeros((6, 6)) if found is None else found)
     return columns
+
+
+def _bends_of(state: State, camera: int, matches: CameraBlock) -> Array:
+    """(66,) see BEND, of some matches.
+
+    At each place the camera has a pose of its own. What no such pose can follow is left in the
+    residuals, at whatever estimate: so it holds on when a camera moves or drifts.
+    """
+    if not any(state.findings.bend_sigmas):
+        return np.zeros(BEND)
+    numbers, at = matches.frame_numbers, dict[str, list[int]]()
+    for number, row in zip(numbers.tolist(), np.searchsorted(state.numbers, numbers), strict=True):
+        at.setdefault(state.at[row], []).append(number)
+    places = [np.array(of_place, dtype=np.int64) for of_place in at.values()]
+    pose = to_T_lidar_camera(state.references[camera])
+    one = distortion_evidence(matches, state.scales[camera], pose, WEAK, places=places)
+    parts = one.hessian, one.hessian @ one.jacobian, one.information, one.vector
+    return np.concatenate([part.ravel() for part in parts])
 
 
 def absorb_again(
@@ -309,37 +333,10 @@ def absorb_again(
             sums = sums_of(state, {camera: gated})
             state.sums = state.sums.replace_at((rows, camera), sums)
             keep_matches(state, {camera: gated})
-    if any(state.findings.bend_sigmas):
-        for epoch in range(len(state.sizes)):
-            bend_epoch(state, epoch, camera)
-
-
-def bend_epoch(state: State, epoch: int, camera: int) -> None:
-    """Compute anew an epoch's evidence of the scan distortion.
-
-    At each place the camera has a pose of its own. What no such pose can follow is left in the
-    residuals, at whatever estimate: so it holds on when a camera moves or drifts.
-    """
-    found, own = np.zeros(BEND), state.matches_of(camera)
-    first, end = state.edges[epoch : epoch + 2]
-    numbers = state.numbers[first:end]
-    if own is not None:
-        raw, inliers = own
-        block = raw.select(inliers & np.isin(raw.frame, numbers))
-        at: dict[str, list[int]] = {}
-        for number, name in zip(numbers.tolist(), state.at[first:end], strict=True):
-            at.setdefault(name, []).append(number)
-        if len(block):
-            places = [np.array(of_place, dtype=np.int64) for of_place in at.values()]
-            pose = to_T_lidar_camera(state.poses[epoch, camera])
-            scale = state.scales[camera]
-            one = distortion_evidence(block, scale, pose, WEAK, places=places)
-            pulled = one.hessian @ one.jacobian
-            parts = one.hessian, pulled, one.information, one.vector
-            found = np.concatenate([part.ravel() for part in parts])
-    bends = state.bends.copy()
-    bends[1 + epoch, camera] = found
-    state.bends = bends
+    own, bends = state.matches_of(camera), state.bends[camera].copy()
+    kept = None if own is None else own[0].select(own[1])  # follow the distortion in another way
+    bends[:54] = _bends_of(state, camera, kept)[:54] if kept else 0.0
+    state.put(camera, bends=bends)
 
 
 def _camera_block(state: State, camera: int, table: Correspondences) -> CameraBlock | None:

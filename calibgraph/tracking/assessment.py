@@ -4,135 +4,98 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from calibgraph.arrays import Array, Mask
+from calibgraph.arrays import Array
 from calibgraph.model.calibration import Calibration
-from calibgraph.model.config import Config
-from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import invert_each, pair_covariances, pose_rows
 from calibgraph.model.pose_kernel import logarithms
 from calibgraph.model.summary import summarize
-from calibgraph.model.verdict import START, Check, Status, Verdict
+from calibgraph.model.verdict import START, Check, Verdict
 from calibgraph.report.as_json import finite
-from calibgraph.solver.error_model import Conflict
 from calibgraph.solver.matches import BlockResiduals
 from calibgraph.tracking.estimate import Estimate
 from calibgraph.tracking.events import Event
 from calibgraph.tracking.frames import StreamFrame
 from calibgraph.tracking.state import COUNTS, State
-from calibgraph.tracking.sums import Numbers, Sums
 from calibgraph.trust.evidence import Estimate as Checked
 from calibgraph.trust.solution_checks import check_estimate
 from calibgraph.trust.thresholds import threshold
 
 
 class Verdicts(Mapping[str, Verdict]):
-    """The verdict of each camera, made when it is read, from what it holds on to of the state."""
+    """The verdict of each camera, made when it is read, from what it holds on to of the state.
+
+    These are small parts, named as there, so that old updates need little memory.
+    """
 
     def __init__(self, state: State, estimate: Estimate) -> None:
-        self._judged = _Judged.of(state, estimate)
+        self.names, self.config, self.findings = state.names, state.config, state.findings
+        self.started, self.absent, self.walk = state.started, state.absent, state.walk
+        self.agreements, self.refused = state.agreements, state.refused
+        self.waiting = tuple(map(len, state.waiting))
+        self.counts = state.counts
+        self.covariance, self.frames = estimate.covariance, estimate.sums.frames
+        self.conflicts = tuple(estimate.conflicts.values())
         self._known: dict[str, Verdict] = {}
 
     def __getitem__(self, name: str) -> Verdict:
         """The verdict of a camera."""
         if name not in self._known:
-            self._known[name] = _verdict(self._judged, self._judged.names.index(name))
+            self._known[name] = _verdict(self, self.names.index(name))
         return self._known[name]
 
     def __iter__(self) -> Iterator[str]:
         """The cameras' names."""
-        return iter(self._judged.names)
+        return iter(self.names)
 
     def __len__(self) -> int:
         """How many cameras there are."""
-        return len(self._judged.names)
+        return len(self.names)
 
 
-class _Judged(NamedTuple):
-    """The small parts of a state and an estimate that verdicts are made of, named as there."""
-
-    names: tuple[str, ...]
-    config: Config
-    findings: MatcherFindings
-    started: Mask
-    counts: Numbers
-    absent: Numbers
-    walk: Numbers
-    agreements: tuple[tuple[tuple[int, bool], ...], ...]
-    refused: tuple[tuple[str, ...], ...]
-    waiting: tuple[int, ...]
-    covariance: Array
-    sums: Sums
-    conflicts: tuple[Conflict, ...]
-
-    @staticmethod
-    def of(state: State, estimate: Estimate) -> _Judged:
-        return _Judged(
-            state.names, state.config, state.findings, state.started, state.counts, state.absent,
-            state.walk, state.agreements, state.refused, tuple(map(len, state.waiting)),
-            estimate.covariance, estimate.sums, tuple(estimate.conflicts.values()),
-        )  # fmt: skip
-
-    def counted(self, camera: int, name: str) -> int:
-        return int(self.counts[camera, COUNTS.index(name)])
-
-
-def _verdict(state: _Judged, camera: int) -> Verdict:
-    name = state.names[camera]
-    conflicts = tuple(one for one in state.conflicts if name in (one.pair.a, one.pair.b))
-    if not state.started[camera]:
-        return _start_check(state, camera)
-    rows, sums = pose_rows(camera), state.sums
-    own = state.covariance[rows, rows]
+def _verdict(of: Verdicts, camera: int) -> Verdict:
+    counts = dict(zip(COUNTS, of.counts[camera].tolist(), strict=True))
+    limit, repeated = of.config.tracking.blind_frames, counts["repeated"]
+    text = f"the last {repeated + 1} frames with matches have the same points"
+    stuck = Check("stuck", "WARN", f"{text}: its stream is stuck, or sends them again")
+    if not of.started[camera]:
+        if repeated >= limit:
+            return Verdict((replace(stuck, status="FAIL"),))
+        needed = of.config.tracking.start_frames
+        waiting = (f"{of.waiting[camera]} of {needed} frames with matches",)
+        reasons = (f"no estimate yet: {reason}" for reason in of.refused[camera] or waiting)
+        return Verdict(tuple(Check(START, "WARN", reason) for reason in reasons))
+    name, rows, absent = of.names[camera], pose_rows(camera), int(of.absent[camera])
+    own = of.covariance[rows, rows]
+    is_free = bool(np.isnan(own).any())
     found = Checked(
         has_matches=True,
-        used=state.counted(camera, "used"),
-        frames=int(sums.frames[camera]),
-        covariance=None if np.isnan(own).any() else own,
-        is_free=bool(np.isnan(own).any()),
-        conflicts=conflicts,
-        scatter_only=not state.findings.states_common_error,
-        tolerance=state.config.tolerance,
+        used=counts["used"],
+        frames=int(of.frames[camera]),
+        covariance=None if is_free else own,
+        is_free=is_free,
+        conflicts=tuple(one for one in of.conflicts if name in (one.pair.a, one.pair.b)),
+        scatter_only=not of.findings.states_common_error,
+        tolerance=of.config.tolerance,
     )
-    return Verdict((*check_estimate(found), *_recent_checks(state, camera)))
-
-
-def _stuck_check(repeated: int, status: Status) -> Check:
-    text = f"the last {repeated + 1} frames with matches have the same points"
-    return Check("stuck", status, f"{text}: its stream is stuck, or sends them again")
-
-
-def _start_check(state: _Judged, camera: int) -> Verdict:
-    needed, repeated = state.config.tracking.start_frames, state.counted(camera, "repeated")
-    if repeated >= state.config.tracking.blind_frames:
-        return Verdict((_stuck_check(repeated, "FAIL"),))
-    waiting = (f"{state.waiting[camera]} of {needed} frames with matches",)
-    reasons = (f"no estimate yet: {reason}" for reason in state.refused[camera] or waiting)
-    return Verdict(tuple(Check(START, "WARN", reason) for reason in reasons))
-
-
-def _recent_checks(state: _Judged, camera: int) -> list[Check]:
-    """Checks of a camera's last frames."""
-    checks, absent = [], int(state.absent[camera])
-    limit, repeated = state.config.tracking.blind_frames, state.counted(camera, "repeated")
+    checks = [*check_estimate(found)]
     if repeated >= limit > absent - repeated:
-        checks.append(_stuck_check(repeated, "WARN"))
+        checks.append(stuck)
     elif absent >= limit:
         text = f"no usable matches in the last {absent} frames"
         checks.append(Check("blind frames", "WARN", text, absent))
-    if state.walk[camera]:
-        text = "drifts: the estimate follows, over fewer frames"
-        checks.append(Check("drift", "WARN", text))
-    agreements = [good for _, good in state.agreements[camera]]
+    if of.walk[camera]:
+        checks.append(Check("drift", "WARN", "drifts: the estimate follows, over fewer frames"))
+    agreements = [good for _, good in of.agreements[camera]]
     if agreements:
         share = 1 - sum(agreements) / len(agreements)
-        name = f"share of the last {len(agreements)} frames that disagree with the estimate"
-        checks.append(threshold("disagreeing_frames").check(share, name=name))
-    return checks
+        text = f"share of the last {len(agreements)} frames that disagree with the estimate"
+        checks.append(threshold("disagreeing_frames").check(share, name=text))
+    return Verdict(tuple(checks))
 
 
 def covariance_by_camera(estimate: Estimate, names: tuple[str, ...]) -> dict[str, Array | None]:
@@ -249,14 +212,14 @@ def make_updates(
 
 def json_lines(updates: Sequence[Update]) -> list[str]:
     """A line of JSON of each update; units are in the keys, matrices row by row."""
-    estimates: dict[int, dict[str, dict[str, Any]]] = {}  # of frames taken in at once: the same
-    lines = []
+    held, estimates, lines = None, dict[str, dict[str, Any]](), []
     for update in updates:
-        if (shared := id(update.verdicts)) not in estimates:
-            estimates[shared] = {name: _estimate(update, name) for name in update.T_camera_lidar}
+        if update.verdicts is not held:  # frames taken in at once have the same
+            held = update.verdicts
+            estimates = {name: _estimate(update, name) for name in update.T_camera_lidar}
         cameras = {
             name: {**own, "used": update.used.get(name, 0), "left_out": name in update.left_out}
-            for name, own in estimates[shared].items()
+            for name, own in estimates.items()
         }
         head = {"frame": update.frame, "stamp_ns": update.stamp_ns}
         content = {**head, "cameras": cameras, "events": [*map(_event, update.events)]}

@@ -16,8 +16,7 @@ from calibgraph.solver.robust import median_norm, robust_spread, scale_from
 from calibgraph.solver.within_place import WEAK
 from calibgraph.tracking.absorption import (
     add_to_totals,
-    bend_epoch,
-    consider_lens,
+    count_epoch,
 )
 from calibgraph.tracking.estimate import EpochGraph, locate_places
 from calibgraph.tracking.events import Event
@@ -54,14 +53,8 @@ def close_epoch(state: State, graph: EpochGraph) -> list[Event]:
     places = np.array([row_of.get(name, -1) for name in state.at], dtype=np.int64)
     for camera in range(len(state.names)):
         _regate(state, camera, places)
-        own = state.matches_of(camera)
-        if own is not None and own[0].frame[-1] >= first:
-            recent = own[0].select(own[0].frame >= first)
-            state.put(camera, lens=consider_lens(state, camera, recent))
-        if any(state.findings.bend_sigmas):
-            bend_epoch(state, len(state.sizes) - 1, camera)
+        count_epoch(state, camera, first)
     state.sizes, state.poses = (*state.sizes, 0), np.concatenate([state.poses, newest[None]])
-    state.bends = np.concatenate([state.bends, np.zeros_like(state.bends[:1])])
     return report_drift(state)
 
 
@@ -98,7 +91,7 @@ def _set_references(state: State, references: Array) -> None:
     )
     state.places = state.places.shift_reference(steps)
     state.walks = state.walks.shift_reference(
-        np.broadcast_to(steps[:, None], (*state.evidence.shape, 6))
+        np.broadcast_to(steps[:, None], (*state.walks.frames.shape, 6))
     )
     state.ungated = state.ungated.shift_reference(steps)
     state.steps, state.shared = state.steps - steps, state.shared - steps
@@ -184,9 +177,6 @@ def _summarize_oldest(state: State) -> None:
         elif before:  # what is left of the drift counts as of one place
             own = state.walks[camera, 0]
             state.places = state.places.with_camera_at(names[-1], camera, own)
-    bends = state.bends.copy()
-    bends[1] += bends[0]
-    state.bends = bends[1:]
     state.numbers, state.at = state.numbers[size:], state.at[size:]
     state.sums, state.sizes, state.poses = state.sums[size:], state.sizes[1:], state.poses[1:]
     for camera in range(len(state.names)):

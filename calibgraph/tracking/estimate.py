@@ -36,8 +36,8 @@ from calibgraph.solver.within_place import (
     relative_covariance,
     split_excess,
 )
+from calibgraph.tracking.cause import sure_inflation
 from calibgraph.tracking.eliminate import Eliminated, block_diagonal, eliminate
-from calibgraph.tracking.noise import sure_inflation
 from calibgraph.tracking.state import Spread, State, rows_of
 from calibgraph.tracking.sums import Numbers, PlaceSums, Sums
 from calibgraph.tracking.window import Window
@@ -134,7 +134,7 @@ class Terms:
             names,
             known,
             seen,
-            np.linalg.cholesky(weighted),
+            np.asarray(np.linalg.cholesky(weighted), dtype=np.float64),
             spread.least,
             state.ratios.cameras * excess,
             _minimum(state, own, known, weighted),
@@ -313,7 +313,7 @@ class EpochGraph:
         """Information and vector of the closed places but some."""
         frames = self.places.frames.any(axis=1)
         names = self.places.names
-        rows = [row for row in np.flatnonzero(frames) if names[row] not in touched]
+        rows = [row for row in np.flatnonzero(frames).tolist() if names[row] not in touched]
         size = 6 * len(state.names)
         if not rows:
             return np.zeros((size, size)), np.zeros(size)
@@ -367,7 +367,7 @@ class EpochGraph:
 
     def shared_model(self, state: State, sums: PlaceSums, spread: Spread) -> LatentPoseModel:
         """What all places share."""
-        findings, bends, n = state.findings, state.bends.sum(axis=0), len(state.names)
+        findings, bends, n = state.findings, state.bends, len(state.names)
         sigmas, shared = np.asarray(findings.bend_sigmas), state.ratios.shared
         size = len(sigmas)
         jacobian, shown, vector = np.zeros((n, 6, size)), np.zeros((size, size)), np.zeros(size)

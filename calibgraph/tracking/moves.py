@@ -33,6 +33,7 @@ from calibgraph.tracking.cause import (
     CLEARLY,
     Cause,
     Steps,
+    add_epoch,
     alarm_limit,
     find_cause,
     squared_sigmas,
@@ -41,9 +42,9 @@ from calibgraph.tracking.cause import (
 from calibgraph.tracking.eliminate import block_diagonal
 from calibgraph.tracking.events import Event, Size
 from calibgraph.tracking.gate import Gated, agrees, refine, sums_of
-from calibgraph.tracking.noise import add_epoch
-from calibgraph.tracking.state import DriftWatch, OutlierFrame, State, rows_of
+from calibgraph.tracking.state import STRENGTHS, DriftWatch, OutlierFrame, State, rows_of
 from calibgraph.tracking.sums import Sums
+from factors import to_runs
 
 Scatters = Mapping[int, Array]
 
@@ -109,6 +110,8 @@ def _scatter(state: State, frames: Array, own: Scatters) -> Array:
 def shift_between(state: State, row: int, end: int | None = None) -> Array:
     """(6 n, 6 n) covariance of the steps between sets of frames, by what places share.
 
+    Errors that frames of the same place share cancel.
+
     Args:
         state: with the older frames, which are of the first set.
         row: of the first frame that is kept and not of the first set.
@@ -128,20 +131,6 @@ def shift_between(state: State, row: int, end: int | None = None) -> Array:
     of_frame = state.total_hessian / np.maximum(state.total_frames, 1.0)[:, None, None]
     own = np.asarray(findings.place_variance * np.linalg.inv(of_frame + WEAK))
     before, after = np.stack([*counts.values()], axis=1)
-    return shift_covariance(before, after, by_cloud, own)
-
-
-def shift_covariance(before: Array, after: Array, by_cloud: Array, own: Array) -> Array:
-    """(6 n, 6 n) covariance of the steps between two sets of frames by what places share.
-
-    Frames of the same place share their errors, which cancel.
-
-    Args:
-        before: (P, n) numbers of frames of the first set, per place and camera.
-        after: (P, n) of the second.
-        by_cloud: (6 n, 6 n) of all cameras, by the cloud's displacement at a place.
-        own: (n, 6, 6) of each camera at a place besides.
-    """
     apart = before / np.maximum(before.sum(axis=0), 1.0)
     apart = apart - after / np.maximum(after.sum(axis=0), 1.0)
     both = apart.T @ apart
@@ -154,8 +143,7 @@ _REPORT = 300  # frames until it is reported in any case
 
 _EVIDENCE_KEPT = 0.98  # of the log-likelihood, from one epoch to the next: half in 34 epochs
 _DISTANCE_CAP = 24.0  # squared sigmas of one epoch: so that a single outlier decides nothing
-_SELECT_WALK = 12.0  # log-likelihood by which a walk must exceed the static model
-_SELECT_STATIC = 12.0  # by which the static model must exceed the walk it started from
+_SELECT = 12.0  # log-likelihood by which a walk must exceed the static model, or this one it
 _PREFER_WALK = 3.0  # by which another strength must exceed the present one
 _LEAST_FRAMES = 4.0  # for a prediction
 
@@ -248,10 +236,10 @@ def select_walk(state: State, camera: int) -> None:
     """
     evidence, walk, best = state.evidence[camera], int(state.walk[camera]), best_walk(state, camera)
     if not walk:
-        if evidence[best] - evidence[0] > _SELECT_WALK:
+        if evidence[best] - evidence[0] > _SELECT:
             follow_drift(state, camera, best)
         return
-    if evidence[0] - evidence[walk] > _SELECT_STATIC:
+    if evidence[0] - evidence[walk] > _SELECT:
         state.put(camera, walk=0, evidence=np.zeros_like(evidence))
         return
     if evidence[best] - evidence[walk] > _PREFER_WALK:
@@ -296,8 +284,6 @@ def detect_step(state: State) -> DetectedStep | None:
     It is accepted when enough outlier frames agree with each other, and every other camera has had
     as many frames to show whether it moved too.
     """
-    if not any(_may_have_moved(state, camera) for camera in range(len(state.names))):
-        return None
     needed, cameras = state.config.tracking.step_frames, range(len(state.names))
     clusters = {camera: _cluster(state, camera) for camera in cameras}
     found_by = {
@@ -317,15 +303,6 @@ def detect_step(state: State) -> DetectedStep | None:
     if waiting and longest < needed + _PATIENCE:
         return None
     return DetectedStep(since, frozenset(found_by), clusters)
-
-
-def _may_have_moved(state: State, camera: int) -> bool:
-    """Whether a cluster of outlier frames may be large enough: if all since its first agree."""
-    needed, frames = state.config.tracking.step_frames, state.outliers[camera]
-    return any(
-        count >= max(needed, _OUTVOTE * _count_agreeing(state, camera, frames[-count].number))
-        for count in range(needed, len(frames) + 1)
-    )
 
 
 def _cluster(state: State, camera: int) -> tuple[OutlierFrame, ...]:
@@ -402,8 +379,8 @@ Measured = tuple[Steps, dict[int, Array]]
 
 _RECENTLY = 300  # frames: a second small step within them is a drift
 _GUESSED_OVERCONFIDENCE = 100.0  # of H, while the frames' scatter is not known
-_OLD_SHARE = 0.25  # of the live epochs: a change before their end came slowly
 _FOLLOWING = 2  # the least walk by which a change is followed: the configured one
+_OLD_SHARE = 0.25  # of the live epochs: a change before their end came slowly
 
 
 def handle_small_step(state: State, detected: DetectedStep) -> list[Event]:
@@ -455,21 +432,21 @@ def _date_step(state: State, detected: DetectedStep) -> tuple[DetectedStep, Meas
     """
     measured = steps, now = _measure_steps(state, detected)
     found_by = [camera for camera in detected.found_by if camera in steps.cameras]
-    if not found_by:
-        return detected, measured
-    before_and_after = {
-        camera: retract_all(np.tile(state.references[camera], (2, 1, 1)),
-                            np.stack([now[camera] - steps.of(place)[0], now[camera]]))
-        for place, camera in enumerate(steps.cameras) if camera in found_by
-    }  # fmt: skip
-    numbers = state.numbers.tolist()
+    numbers, gain = state.numbers.tolist(), np.full(len(state.numbers), np.nan)
+    for camera in found_by:
+        step, _ = steps.of(steps.cameras.index(camera))
+        raw = merge(_blocks_since(state, replace(detected, since=numbers[0]), camera))
+        ends, runs = np.stack([now[camera] - step, now[camera]]), to_runs(raw.frame_edges)
+        before, after = (
+            raw.with_scale(state.scales[camera]).run_sums(np.tile(T, (len(runs), 1, 1)), runs).cost
+            for T in retract_all(np.tile(state.references[camera], (2, 1, 1)), ends)
+        )
+        rows = np.searchsorted(numbers, raw.frame_numbers)
+        gain[rows] = np.nan_to_num(gain[rows]) + before - after
     place = state.first_row(detected.since)
-    while place > 0 and _fits_better(state, detected, numbers[place - 1], before_and_after):
+    while place > 0 and gain[place - 1] > 0:
         place -= 1
-    while (
-        place < len(numbers) - 1
-        and _fits_better(state, detected, numbers[place], before_and_after) is False
-    ):
+    while place < len(numbers) - 1 and gain[place] <= 0:
         place += 1
     since = numbers[min(place, len(numbers) - 1)]
     if since == detected.since:
@@ -479,22 +456,6 @@ def _date_step(state: State, detected: DetectedStep) -> tuple[DetectedStep, Meas
     if set(found_by) <= set(remeasured[0].cameras):
         return dated, remeasured
     return detected, measured
-
-
-def _fits_better(
-    state: State, detected: DetectedStep, number: int, before_and_after: dict[int, Array]
-) -> bool | None:
-    """Whether a frame fits the second estimates better than the first; None without matches."""
-    seen, gain = False, 0.0
-    for camera, poses in before_and_after.items():
-        set_aside = detected.outlier_frames.get(camera, ())
-        found = [one.raw for one in set_aside if one.number == number]
-        found = found or _kept(state, camera, number, number)
-        for raw in found[:1]:
-            block, seen = raw.with_scale(state.scales[camera]), True
-            before, after = block.costs_at_each(poses)
-            gain += float(before - after)
-    return gain > 0 if seen else None
 
 
 def _make_events(state: State, since: int, steps: Steps, cause: Cause) -> list[Event]:
@@ -521,15 +482,12 @@ def _restart_camera(
     if drift is not None:
         steps = np.where(np.arange(len(state.names))[:, None] == camera, step, 0.0)
         state.drift = None if drift.camera == camera else drift.about(steps)
-    bends = state.bends.copy()
-    bends[:, camera, :54] = 0.0  # its matches follow the distortion in another way now
-    state.bends = bends
     state.sums = state.sums.replace_at((slice(None), camera), Sums.zeros())
     state.places = state.places.without(camera)
     state.put(
         camera,
         blocks=(), inliers=(), outliers=(), agreements=(), moved_at=state.updates, absent=0,
-        walks=Sums.zeros(len(state.evidence[camera])), evidence=0.0, walk=0, ungated=Sums.zeros(),
+        walks=Sums.zeros(len(STRENGTHS)), evidence=0.0, walk=0, ungated=Sums.zeros(),
     )  # fmt: skip
     absorb_again(state, camera, blocks, T_camera_lidar)
 
@@ -544,22 +502,12 @@ def _drop_pairs_of(state: State, cameras: Iterable[int]) -> None:
     state.dropped_pairs = tuple(sorted({*state.dropped_pairs, *wrong}))
 
 
-def _kept(state: State, camera: int, first: int, last: int) -> list[CameraBlock]:
-    """A camera's absorbed matches in the frames of some numbers."""
-    found = []
-    for raw in state.blocks[camera]:
-        rows = (raw.frame >= first) & (raw.frame <= last)
-        if rows.any():
-            found.append(raw.select(rows))
-    return found
-
-
 def _blocks_since(state: State, detected: DetectedStep, camera: int) -> list[CameraBlock]:
     """A camera's matches in the frames since a step, including those set aside."""
-    last = max(detected.since, int(state.numbers[-1]))
-    outliers = detected.outlier_frames.get(camera, ())
-    set_aside = [one.raw for one in outliers if one.number >= detected.since]
-    return _kept(state, camera, detected.since, last) + set_aside
+    own, outliers = state.matches_of(camera), detected.outlier_frames.get(camera, ())
+    kept = [] if own is None else [own[0].select(own[0].frame >= detected.since)]
+    kept += [one.raw for one in outliers if one.number >= detected.since]
+    return [raw for raw in kept if len(raw)]
 
 
 def _sums_since(state: State, detected: DetectedStep) -> Sums:

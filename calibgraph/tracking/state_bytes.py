@@ -32,7 +32,7 @@ from factors import Lens, ProjectionBlock
 
 Kind = TypeVar("Kind")
 
-_MARK = b"calibgraph-tracker/15\n"
+_MARK = b"calibgraph-tracker/16\n"
 _BODY = len(_MARK) + hashlib.sha256().digest_size
 _DTYPES = ("<f8", "<f4", "<i8", "<i4", "|b1")
 
@@ -74,23 +74,20 @@ def decode(data: bytes, kind: type[Kind]) -> Kind:
 
 
 def _pack(value: object) -> bytes:
-    packed: bytes = msgpack.packb(value, default=_extension)
+    def extension(value: Any) -> msgpack.ExtType:
+        if (code := _CODES.get(type(value))) is None:
+            raise TypeError(f"cannot write a {type(value).__name__}")
+        return msgpack.ExtType(code, _pack(_KINDS[code][1](value)))
+
+    packed: bytes = msgpack.packb(value, default=extension)
     return packed
 
 
 def _unpack(data: bytes) -> Any:
-    return msgpack.unpackb(data, ext_hook=_from_extension, use_list=False, strict_map_key=False)
-
-
-def _extension(value: Any) -> msgpack.ExtType:
-    code = _CODES.get(type(value))
-    if code is None:
-        raise TypeError(f"cannot write a {type(value).__name__}")
-    return msgpack.ExtType(code, _pack(_KINDS[code][1](value)))
-
-
-def _from_extension(code: int, data: bytes) -> Any:
-    return _KINDS[code][2](_unpack(data))
+    return msgpack.unpackb(
+        data, ext_hook=lambda code, held: _KINDS[code][2](_unpack(held)), use_list=False,
+        strict_map_key=False,
+    )  # fmt: skip
 
 
 def _array(value: NDArray[Any]) -> tuple[str, tuple[int, ...], bytes]:

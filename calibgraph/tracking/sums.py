@@ -22,7 +22,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -214,18 +213,20 @@ class PlaceSums:
         """(P, n) how many."""
         return self.rows.frames
 
-    @cached_property
+    @property
     def count(self) -> float:
         """Number of places."""
         older = self.places[0].max() if self.frames[0].any() else 0.0
         return float(np.count_nonzero(self.frames[1:].any(axis=1)) + older)
 
-    @cached_property
+    @property
     def places(self) -> Array:
         """(P, n) as how many places with equally many frames each row counts."""
-        counts = np.ones_like(self.frames)
-        squared = np.maximum(self.older_squared, 1e-300)
-        counts[0] = np.where(self.older_squared > 0, self.frames[0] ** 2 / squared, 1.0)
+        counts, squared = np.ones_like(self.frames), self.older_squared
+        if squared.any():
+            counts[0] = np.where(
+                squared > 0, self.frames[0] ** 2 / np.maximum(squared, 1e-300), 1.0
+            )
         return counts
 
     @property

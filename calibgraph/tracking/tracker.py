@@ -326,20 +326,22 @@ def _preprocessed(
     if not len(table):
         return group, table, repeated, found
     config, cameras = state.config, [*state.rig.cameras.values()]
-    usable = table.without_cameras(config.excluded_cameras)
+    usable = table.without_cameras(config.excluded_cameras) if config.excluded_cameras else table
     numbers = camera_numbers(rig, usable)
     confident = are_projectable(rig, usable, numbers) & (usable.confidence >= config.confidence_min)
     rows = best_in_cell(rig, usable, numbers, config, among=confident)
-    kept, numbers = usable.select(rows), numbers[rows]
-    if len(group) > 1 and not np.array_equal(number_repeats(kept, numbers), kept.frame):
-        return _preprocessed(state, group[:1], rig)
-    capped = within_cap(kept, numbers, config) if len(kept) > config.matches_max else None
-    if capped is not None:
-        kept, numbers = kept.select(capped), numbers[capped]
+    numbers = numbers[rows]
+    if len(group) > 1:
+        kept = usable.select(rows)
+        if not np.array_equal(number_repeats(kept, numbers), kept.frame):
+            return _preprocessed(state, group[:1], rig)
+    if len(rows) > config.matches_max:
+        capped = within_cap(usable.select(rows), numbers, config)
+        rows, numbers = (rows, numbers) if capped is None else (rows[capped], numbers[capped])
     edges = np.searchsorted(numbers, np.arange(len(cameras) + 1)).tolist()
     for camera, (first, end) in enumerate(pairwise(edges)):
         if end - first >= MIN_MATCHES:
-            block = camera_block(cameras[camera], kept.select(slice(first, end)), config)
+            block = camera_block(cameras[camera], usable.select(rows[first:end]), config)
             block = block if len(group) == 1 else _with_enough(block)
             found |= {camera: block} if len(block) else {}
     return group, table, repeated, found

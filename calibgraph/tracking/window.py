@@ -36,37 +36,29 @@ class Window:
     """
 
     def __init__(self, model: LatentPoseModel, references: Array) -> None:
-        self.model = model
-        self._start = gtsam.Values()
-        self._start.insert(CLOUD, gtsam.Pose3())
-        poses = [*map(to_T_lidar_camera, references)]
-        for camera, pose in enumerate(poses):
-            self._start.insert(matched_key(camera), pose)
-        others = gtsam.Values()
-        for camera, pose in enumerate(poses):
-            others.insert(camera_key(camera), pose)
+        self.model, self.adjoint, cameras = model, adjoints(references), range(len(references))
+        self._poses, shared = [*map(to_T_lidar_camera, references)], gtsam.Values()
+        self._keys, self._start = [CLOUD, *map(matched_key, cameras)], gtsam.Values()
+        for key, pose in zip(self._keys, [gtsam.Pose3(), *self._poses], strict=True):
+            self._start.insert(key, pose)
+        for camera, pose in enumerate(self._poses):
+            shared.insert(camera_key(camera), pose)
             if camera in model.aligned:
-                others.insert(aligned_key(camera), pose)
+                shared.insert(aligned_key(camera), pose)
         if model.is_distorted:
-            size = model.components.distortion_jacobian.shape[2]
-            others.insert(DISTORTION, np.zeros(size))
-        self._keys = [CLOUD, *map(matched_key, range(len(poses)))]
-        self.adjoint = adjoints(references)
-        cameras = len(poses)
-        self._chain = np.hstack([-self.adjoint.reshape(-1, _POSE), np.eye(_POSE * cameras)])
-        self._poses = poses
+            shared.insert(DISTORTION, np.zeros(model.components.distortion_jacobian.shape[2]))
+        shared.insert(self._start)
+        size = _POSE * len(cameras)
+        self._chain = np.hstack([-self.adjoint.reshape(-1, _POSE), np.eye(size)])
         parameters = gtsam.ISAM2Params()
         parameters.setFactorization("QR")  # Cholesky takes sigmas 4096 times apart for singular
         parameters.setRelinearizeThreshold(_RELINEARIZE)
         parameters.relinearizeSkip = 1
         parameters.findUnusedFactorSlots = True
-        self._isam = gtsam.ISAM2(parameters)
-        others.insert(self._start)
-        self._all = others
-        self._isam.update(model.shared_graph, others)
-        self._slots: list[int] = []
+        self._isam, self._all, self._slots = gtsam.ISAM2(parameters), shared, list[int]()
+        self._isam.update(model.shared_graph, shared)
         for _ in range(2):
-            self.exchange(np.eye(_POSE * cameras), np.zeros(_POSE * cameras))
+            self.exchange(np.eye(size), np.zeros(size))
 
     def exchange(self, information: Array, vector: Array) -> None:
         """Put a quadratic on the cameras, as matches show them, in the place of the one before.
@@ -100,16 +92,15 @@ class Window:
     def shown(self) -> Array:
         """(n, 6) from the references to where matches show the cameras at all places."""
         cloud = self.values.atPose3(CLOUD)
-        at = (cloud.between(self.values.atPose3(key)) for key in self._keys[1:])
-        pairs = zip(self._poses, at, strict=True)
-        return np.array([one.localCoordinates(other) for one, other in pairs])
+        return self._away([cloud.between(self.values.atPose3(key)) for key in self._keys[1:]])
 
     def steps(self, keys: Sequence[int]) -> Array:
         """(6 n,) from the references to the estimates of some poses, one of each camera."""
-        pairs = zip(self._poses, keys, strict=True)
-        return np.concatenate(
-            [pose.localCoordinates(self.values.atPose3(key)) for pose, key in pairs]
-        )
+        return self._away([*map(self.values.atPose3, keys)]).ravel()
+
+    def _away(self, poses: Sequence[gtsam.Pose3]) -> Array:
+        pairs = zip(self._poses, poses, strict=True)
+        return np.array([reference.localCoordinates(pose) for reference, pose in pairs])
 
     def T_camera_lidar(self, keys: Sequence[int]) -> Array:
         """(n, 4, 4) of some estimates."""
@@ -144,8 +135,7 @@ class Window:
             found += float(np.trace(np.linalg.solve(parts.camera, apart)))
         if self.model.is_distorted:
             distortion = gtsam.NonlinearFactorGraph()
-            for index in range(self.model.error_graph.size()):
-                factor = self.model.error_graph.at(index)
+            for factor in map(self.model.error_graph.at, range(self.model.error_graph.size())):
                 if [*factor.keys()] == [DISTORTION]:
                     distortion.add(factor)
             known = distortion.linearize(self.values).hessian(gtsam.Ordering([DISTORTION]))[0]

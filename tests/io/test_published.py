@@ -232,7 +232,8 @@ def record(change: dict[str, Any]) -> Callable[[Path], None]:
 
 CAM, VELO = "../calib_cam_to_cam.txt", "../calib_velo_to_cam.txt"
 TABLES = "v1.0-mini/"
-BROKEN: list[tuple[str, str, Callable[[Path], object], str]] = [
+Row = tuple[str, str, Callable[[Path], object], str]
+BROKEN: list[Row] = [
     ("sequence", "calib.txt", line("P2", "P2:" + " 0" * 12), "P2: is no camera matrix"),
     ("sequence", "calib.txt", line("P2", "P2: -7 0 6 0 0 7 2 0 0 0 1 0"), "is no camera matrix"),
     ("sequence", "calib.txt", line("P2", "P2: 1400 0 1200 0 0 1400 360 0 0 0 2 0"), "divide by 2"),
@@ -271,17 +272,9 @@ BROKEN: list[tuple[str, str, Callable[[Path], object], str]] = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("name", "file", "change", "said"), BROKEN, ids=[row[-1] for row in BROKEN]
-)
-def test_a_broken_folder_is_one_line(  # noqa: PLR0917
-    name: str,
-    file: str,
-    change: Callable[[Path], object],
-    said: str,
-    folders: dict[str, Path],
-    tmp_path: Path,
-) -> None:
+@pytest.mark.parametrize("row", BROKEN, ids=lambda row: row[-1])
+def test_a_broken_folder_is_one_line(row: Row, folders: dict[str, Path], tmp_path: Path) -> None:
+    name, file, change, said = row
     folder = copied(folders, name, tmp_path)
     change(folder / file)
     with pytest.raises(CalibrationError, match=re.escape(said)) as caught:
@@ -308,26 +301,22 @@ def without_key_frames(path: Path) -> None:
     path.write_text(json.dumps(records))
 
 
-@pytest.mark.parametrize(
-    ("name", "file", "change", "said"),
-    [
-        ("sequence", "calib.txt", line("P3", ""), "line 'P3' is missing: camera 'image_3'"),
-        ("drive", CAM, line("P_rect_03", ""), "line 'P_rect_03' is missing: camera 'image_03'"),
-        ("drive", "image_00/data", lambda path: path.mkdir(parents=True), "camera 'image_00'"),
-        ("nuscenes", f"{TABLES}calibrated_sensor.json", without_matrix, "camera 'front_right'"),
-        ("nuscenes", f"{TABLES}sample_data.json", without_key_frames, "camera 'front_right'"),
-        ("argoverse", LENSES, without_row, "has no row of 'front_right'; found front_left: camera"),
-        ("argoverse", POSES, without_row, "has no row of 'front_right'; found front_left: camera"),
-    ],
-)
-def test_a_camera_without_a_part_is_left_out_with_a_note(  # noqa: PLR0917
-    name: str,
-    file: str,
-    change: Callable[[Path], object],
-    said: str,
-    folders: dict[str, Path],
-    tmp_path: Path,
+WITHOUT_A_CAMERA: list[Row] = [
+    ("sequence", "calib.txt", line("P3", ""), "line 'P3' is missing: camera 'image_3'"),
+    ("drive", CAM, line("P_rect_03", ""), "line 'P_rect_03' is missing: camera 'image_03'"),
+    ("drive", "image_00/data", lambda path: path.mkdir(parents=True), "camera 'image_00'"),
+    ("nuscenes", f"{TABLES}calibrated_sensor.json", without_matrix, "camera 'front_right'"),
+    ("nuscenes", f"{TABLES}sample_data.json", without_key_frames, "camera 'front_right'"),
+    ("argoverse", LENSES, without_row, "has no row of 'front_right'; found front_left: camera"),
+    ("argoverse", POSES, without_row, "has no row of 'front_right'; found front_left: camera"),
+]
+
+
+@pytest.mark.parametrize("row", WITHOUT_A_CAMERA, ids=lambda row: row[-1])
+def test_a_camera_without_a_part_is_left_out_with_a_note(
+    row: Row, folders: dict[str, Path], tmp_path: Path
 ) -> None:
+    name, file, change, said = row
     folder = copied(folders, name, tmp_path)
     change(folder / file)
     data = load_dataset(folder)

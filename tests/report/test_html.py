@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import html
 import re
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,9 +14,8 @@ from scipy.spatial.transform import Rotation
 
 import calibgraph
 from calibgraph import Calibration, Check, Rig, Verdict, perturb
-from calibgraph.errors import DatasetError
 from calibgraph.model.lens import LensEstimate
-from calibgraph.report.html import relocate_frames, worked_point
+from calibgraph.report.html import worked_point
 from calibgraph.report.plots import (
     ARROW_COLUMNS,
     arrow_factor,
@@ -26,7 +24,7 @@ from calibgraph.report.plots import (
     reprojection_errors,
 )
 from calibgraph.solver.robust import constrained_error_px
-from tests.conftest import SAMPLE, CommandRun
+from tests.conftest import CommandRun
 from tests.report.browsing import render
 from tests.report.conftest import read_page, solve_simulated, write_page
 
@@ -147,27 +145,6 @@ def test_a_guess_that_projects_no_point_is_drawn(
     guess = sample_result.initial_rig.moved_to(backwards)
     turned = replace(sample_result, initial_rig=guess)
     assert write_page(turned, tmp_path).count("data:image/jpeg") == 3 * 2
-
-
-def test_a_dataset_that_has_moved_is_found(sample_result: Calibration, tmp_path: Path) -> None:
-    moved = Path(shutil.copytree(SAMPLE, tmp_path / "moved"))
-    dataset = calibgraph.load_dataset(moved)
-    found = relocate_frames(sample_result, dataset)
-    assert [frame["name"] for frame in found.frames] == [f["name"] for f in sample_result.frames]
-    assert all(frame["cloud"].startswith(str(moved)) for frame in found.frames)
-    assert relocate_frames(replace(sample_result, frames=()), dataset).frames == found.frames
-    with pytest.raises(DatasetError, match="has no frame number 3 named '000003'"):
-        relocate_frames(sample_result, dataset.select("0:3"))
-
-
-def test_another_recording_with_the_same_names_is_refused(
-    sample_result: Calibration, tmp_path: Path
-) -> None:
-    other = Path(shutil.copytree(SAMPLE, tmp_path / "other"))
-    first, second = sorted((other / "cameras" / "left").iterdir())[:2]
-    shutil.copy(second, first)
-    with pytest.raises(DatasetError, match=f"{first}: is not what the result was made from"):
-        relocate_frames(sample_result, calibgraph.load_dataset(other))
 
 
 def test_vectors_of_edges_have_the_length_that_the_gate_compares() -> None:

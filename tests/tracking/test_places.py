@@ -38,7 +38,6 @@ from calibgraph.solver.joint import solve_joint
 from calibgraph.tracking import DurableCalibrator, IncrementalCalibrator
 from calibgraph.tracking.estimate import Terms, every_place
 from calibgraph.trust.evidence import gather
-from factors import robust_noise
 from tests.conftest import stereo_relative_pose
 from tests.draws.places import Drawn, draw_places, tied
 from tests.tracking.drives import drive, pair_of, track_draw
@@ -225,7 +224,11 @@ def whole_graph(tracker: IncrementalCalibrator) -> tuple[gtsam.NonlinearFactorGr
 
 
 def robust(noise: gtsam.noiseModel.Gaussian, scale: float) -> gtsam.noiseModel.Base:
-    return robust_noise(noise, loss="geman_mcclure", scale=scale) if np.isfinite(scale) else noise
+    if not np.isfinite(scale):
+        return noise
+    return gtsam.noiseModel.Robust.Create(
+        gtsam.noiseModel.mEstimator.GemanMcClure.Create(scale), noise
+    )
 
 
 def test_what_is_reported_is_optimum_and_marginal_of_the_graph() -> None:

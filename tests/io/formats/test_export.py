@@ -201,6 +201,11 @@ def test_files_that_are_there_are_replaced_only_with_force(tmp_path: Path) -> No
     assert path.read_text() == before
     export_calibration(path, path, "kalibr", force=True)
     assert path.read_text() != before
+    (tmp_path / "right.yaml").write_text("mine")
+    with pytest.raises(FileError, match="right.yaml: is there already"):
+        export_calibration(rig, tmp_path, "camera_info")
+    assert not (tmp_path / "left.yaml").exists()
+    assert len(export_calibration(rig, tmp_path, "camera_info", force=True)) == 2
 
 
 _KEYS = [
@@ -254,15 +259,6 @@ def test_a_file_has_what_the_parser_of_ros_requires(tmp_path: Path) -> None:
         assert found[key]["data"] == matrix.ravel().tolist()
     assert found["distortion_coefficients"] == {"rows": 1, "cols": 5, "data": [0.0] * 5}
     assert "export it as ros2-launch" in text
-
-
-def test_lenses_that_are_there_stay(tmp_path: Path) -> None:
-    rig = make_pair()
-    (tmp_path / "right.yaml").write_text("mine")
-    with pytest.raises(FileError, match="right.yaml: is there already"):
-        export_calibration(rig, tmp_path, "camera_info")
-    assert not (tmp_path / "left.yaml").exists()
-    assert len(export_calibration(rig, tmp_path, "camera_info", force=True)) == 2
 
 
 def test_what_has_no_place_in_files_of_ros_is_refused(tmp_path: Path) -> None:

@@ -148,15 +148,6 @@ class TestRounds:
         for name in ("pixels_px", "points_lidar_m", "information_px", "frame"):
             np.testing.assert_array_equal(*(getattr(table, name) for table in tables))
 
-    @pytest.mark.slow
-    def test_a_seed_determines_the_result(self) -> None:
-        data = calibgraph.load_dataset(SAMPLE).select("0:2")
-        one, two = (
-            calibgraph.calibrate(data, matcher=without_search(LEVELS[:1])) for _ in range(2)
-        )
-        for name, T in one.T_camera_lidar.items():
-            np.testing.assert_array_equal(T, two.T_camera_lidar[name])
-
     @pytest.mark.usefixtures("no_image_checks")
     def test_a_camera_that_sees_none_of_the_cloud_is_named(self, truth: Rig) -> None:
         T = dict(truth.T_camera_lidar)

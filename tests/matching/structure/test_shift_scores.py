@@ -83,38 +83,6 @@ def test_images_finer_than_the_finest_level_needs_are_reduced() -> None:
     np.testing.assert_array_equal(kept.gray, gray[::2, ::2])
 
 
-def orthonormal(points: int, columns: int, rng: np.random.Generator) -> np.ndarray:
-    """(points, columns), orthogonal to constants too."""
-    draws = np.column_stack([np.ones(points), rng.standard_normal((points, columns))])
-    return np.linalg.qr(draws)[0][:, 1:]
-
-
-@pytest.mark.parametrize("likelihood", [False, True])
-@pytest.mark.parametrize("sign", [-1, 1])
-def test_the_score_of_a_window_is_its_share_of_the_images_variance(
-    likelihood: bool, sign: int
-) -> None:
-    rng = np.random.default_rng(0)
-    image = sign * rng.standard_normal((20, 30)).astype(np.float32)
-    places = rng.integers([10, 8], [18, 14], (12, 2)).astype(np.int32)
-    basis = orthonormal(12, 4, rng).astype(np.float32)
-    basis[:, 2:] *= not likelihood
-    grids = np.zeros((1, 5, 5), np.float32)
-    score_windows(
-        pad(image), places[None], np.array([12], np.int32), basis[None], np.zeros(1, np.int32),
-        np.array([-2, -2]), likelihood, grids,
-    )  # fmt: skip
-    seen = image[places[:, 1] - 1, places[:, 0] + 2]  # at the shift (2, -1)
-    depth, intensity, *trend = basis.T @ seen
-    variance = 12 * seen.var() - np.square(trend).sum() + 12 * GRAY_NOISE**2
-    weight = 1 if intensity > 0 else OPPOSITE
-    structured = 1 - 12 * GRAY_NOISE**2 / variance
-    chance = (CHANCE_DEPTH + CHANCE_INTENSITY) * structured
-    share = (depth**2 + weight * intensity**2) / variance - chance
-    log = -np.log(1 - share / (1 + MIN_RESIDUAL_SHARE))
-    assert grids[0, 1, 4] == pytest.approx(log if likelihood else share, rel=1e-4)
-
-
 @pytest.mark.parametrize("likelihood", [False, True])
 @pytest.mark.parametrize("size", [(1, 1), (9, 13), (13, 17), (6, 33)])
 def test_scores_are_those_of_the_formula_wherever_a_window_is_in_the_image(

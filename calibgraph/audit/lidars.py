@@ -1,0 +1,134 @@
+"""Deployed poses of LiDARs against a recording: each is measured again, from where it is deployed.
+
+A LiDAR is compared as a camera is: its motion in its own axes, T_deployed_now = exp(xi). Poses of a
+result have error bars, which count beside those of the measurement.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from calibgraph.arrays import Array
+from calibgraph.audit.judgement import (
+    LIDAR_AXES,
+    SINGLE_LIDAR,
+    detectable,
+    judge_deviation,
+    student_quantiles,
+    tail_of_axis,
+)
+from calibgraph.audit.result import CameraAudit
+from calibgraph.errors import CalibrationError, RigError
+from calibgraph.io.dataset import Dataset
+from calibgraph.model.config import Config
+from calibgraph.model.geometry import invert, twist_between
+from calibgraph.model.rig import Rig
+from calibgraph.progress import Progress
+from calibgraph.vehicle.lidars import PLACE_FREEDOM
+from calibgraph.vehicle.rig import LidarResult, calibrate_rig_lidars
+
+_UNUSABLE = ("lidar_matched", "lidar_start")  # kinds of checks
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredLidars:
+    """The LiDARs but the base, measured again.
+
+    Attributes:
+        audits: per LiDAR.
+        deviation: (6 k,) of all, as of an audit; empty if they could not be measured.
+        covariance: (6 k, 6 k) of it.
+        T_lidar_base: (4, 4) each, as deployed.
+    """
+
+    audits: dict[str, CameraAudit]
+    deviation: Array
+    covariance: Array
+    T_lidar_base: list[Array]
+
+
+def measure_lidars(
+    deployed: Rig, data: Dataset, config: Config, tolerance: Array, *, sensors: int,
+    progress: Progress,
+) -> MeasuredLidars:  # fmt: skip
+    """Measure the LiDARs of a rig again, and compare them with where they are deployed.
+
+    Args:
+        deployed: with a pose of each.
+        data: its frames have their clouds.
+        config: of the verdict of what is measured.
+        tolerance: (2,) of a turn [rad] and a shift [m].
+        sensors: number of all that are compared, over which false alarms are shared.
+        progress: called as the work goes on.
+
+    Raises:
+        RigError: if a LiDAR has no pose.
+        DatasetError: if no instant has all clouds.
+    """
+    names, known = deployed.other_lidars, deployed.T_base_lidar
+    if missing := [name for name in names if name not in known]:
+        raise RigError(
+            f"lidars.{missing[0]}: has no T_base_lidar, so that there is no pose to compare; "
+            "calibrate it first"
+        )
+    rig = deployed.model_copy(update={"vehicle": None})
+    try:
+        found = calibrate_rig_lidars(data, rig, config, progress=progress)
+    except CalibrationError as error:
+        if error.__class__ is not CalibrationError:  # of the data
+            raise
+        audits = {name: CameraAudit("CANNOT TELL", str(error)) for name in names}
+        return MeasuredLidars(audits, np.empty(0), np.empty((0, 0)), [])
+    T_lidar_base = [invert(known[name]) for name in names]
+    now = found.poses.T_base_lidar
+    deviations = [
+        twist_between(T, invert(now[name])) for name, T in zip(names, T_lidar_base, strict=True)
+    ]
+    covariance = _covariance(found, deployed)
+    freedom = freedom_of_places(found.poses.places, len(names))
+    quantiles = student_quantiles(freedom, tail_of_axis(sensors))
+    audits = {}
+    for row, name in enumerate(names):
+        own = covariance[6 * row : 6 * row + 6, 6 * row : 6 * row + 6]
+        status, reason = judge_deviation(
+            deviations[row], own, quantiles, tolerance, axes=LIDAR_AXES
+        )
+        if doubt := _doubt(found, name):
+            status, reason = "CANNOT TELL", doubt
+        elif status == "WRONG" and sensors == 1:
+            reason += SINGLE_LIDAR
+        sigma = np.sqrt(np.diag(own))
+        audits[name] = CameraAudit(
+            status, reason, deviations[row], sigma, detectable(sigma, quantiles[1])
+        )
+    return MeasuredLidars(audits, np.concatenate(deviations), covariance, T_lidar_base)
+
+
+def freedom_of_places(places: int, lidars: int) -> float:
+    """Degrees of freedom of the covariance of LiDARs from so many places."""
+    return PLACE_FREEDOM + 3.0 * lidars * (places - 1)
+
+
+def _covariance(found: LidarResult, deployed: Rig) -> Array:
+    """(6 k, 6 k) of the deviations: of the measurement and, if it is known, of what is deployed."""
+    names, joint = deployed.other_lidars, found.poses.joint_covariance.copy()
+    for row, name in enumerate(names):
+        own = (deployed.lidars or {})[name].covariance
+        if own is not None:
+            joint[6 * row : 6 * row + 6, 6 * row : 6 * row + 6] += own
+    turns = [deployed.T_base_lidar[name][:3, :3].T for name in names for _ in range(2)]
+    to_own = block_diag(*turns)
+    return np.asarray(to_own @ joint @ to_own.T)
+
+
+def _doubt(found: LidarResult, name: str) -> str:
+    """Why a measurement cannot be used; empty if it can."""
+    checks = found.verdicts[name].checks
+    return "; ".join(
+        check.text
+        for check in checks
+        if (check.kind or check.name) in _UNUSABLE and check.status != "PASS"
+    )
