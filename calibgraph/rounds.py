@@ -40,8 +40,10 @@ from calibgraph.matching.run import (
     with_motion,
 )
 from calibgraph.matching.same_images import require_different_images
+from calibgraph.matching.structure.pose_search import are_same_pose
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences, concatenate
+from calibgraph.model.geometry import invert
 from calibgraph.model.lens import LensEstimate, change_of_lens, unsettled
 from calibgraph.model.metrics import perturb
 from calibgraph.model.places import Places, as_groups
@@ -180,6 +182,7 @@ def rematch(run: MatchingRun, *, confirmed: bool = False) -> MatchingRun:
     tracking, findings = run.matcher.tracking_rounds, run.correspondences.findings
     if not tracking or not run.solution.objective.uses_correspondences:
         return run
+    run = run if confirmed else follow_neighbours(run)
     ended, rig = run.solution.T_camera_lidar, run.solution.solved_rig
     seed = run.solution.config.seed
     start = perturb(rig, rotation_deg=REMATCH_DEG, translation_m=REMATCH_M, seed=seed)
@@ -201,6 +204,31 @@ def rematch(run: MatchingRun, *, confirmed: bool = False) -> MatchingRun:
     except CorrespondenceError as error:
         both = {name: (T, T) for name, T in ended.items()}
         return replace(run, rematch=both, rematch_failure=str(error))
+
+
+def follow_neighbours(run: MatchingRun) -> MatchingRun:
+    """Match again from where most cameras have gone, those that have left them.
+
+    Where more than half of the cameras keep the relative poses of the guess, the others may have
+    ended at a wrong optimum. They start again where the guess has them beside these, and the end at
+    which images and clouds agree better is taken.
+    """
+    guess, ended = run.guess.T_camera_lidar, run.solution.T_camera_lidar
+    moves = [invert(guess[name]) @ T for name, T in ended.items()]  # of the cloud, by each camera
+    placed = [{name: guess[name] @ move for name in ended} for move in moves]
+    left = [[n for n, T in of.items() if not are_same_pose(T, ended[n])] for of in placed]
+    fewest = min(range(len(left)), key=lambda k: len(left[k]))
+    astray = left[fewest]
+    if not 0 < len(astray) < len(ended) / 2:
+        return run
+    start = run.solution.solved_rig.moved_to({name: placed[fewest][name] for name in astray})
+    rounds = (0, *run.matcher.tracking_rounds)
+    with suppress(CorrespondenceError):
+        again = run_again(run, start, rounds)
+        if again and (better := better_cameras(run, again, [(name,) for name in astray])):
+            _log.info("beside their neighbours images and clouds agree better: %s", better)
+            return with_cameras_of(run, again, better)
+    return run
 
 
 def run_again(
