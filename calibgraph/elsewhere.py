@@ -26,7 +26,6 @@ from calibgraph.rounds import (
     run_again,
     with_cameras_of,
 )
-from calibgraph.solver.joint import solve_without_failing
 from calibgraph.trust.evidence import Evidence, gather_of_run
 
 _TIMES = 3  # at most: a posterior that its prior cuts off shows the way, not the end
@@ -64,7 +63,7 @@ def _go_on(
     fine = run.matcher.tracking_rounds[-1:]
     try:
         with run.watch("match_again"):
-            again = run_again(run, start, fine, solve=solve_without_failing)
+            again = run_again(run, start, fine)
             better = [] if again is None else better_cameras(run, again, groups)
             if again is None or not better:
                 return None

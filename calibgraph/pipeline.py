@@ -79,7 +79,7 @@ def calibrate(
     """
     report, watch = progress or no_progress, Stopwatch()
     data = dataset if isinstance(dataset, Dataset) else load_dataset(dataset, rig)
-    rig, lidars = rig or data.rig, None
+    rig, lidars = (rig if rig and data is dataset else data.rig), None
     if rig.other_lidars:
         with watch("lidars"):
             lidars = calibrate_rig_lidars(data, rig, config or Config(), progress=report)

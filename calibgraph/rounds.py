@@ -40,8 +40,10 @@ from calibgraph.matching.run import (
     with_motion,
 )
 from calibgraph.matching.same_images import require_different_images
+from calibgraph.matching.structure.pose_search import are_same_pose
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences, concatenate
+from calibgraph.model.geometry import invert
 from calibgraph.model.lens import LensEstimate, change_of_lens, unsettled
 from calibgraph.model.metrics import perturb
 from calibgraph.model.places import Places, as_groups
@@ -170,16 +172,17 @@ def run_rounds(
         yield table, solution, rounds
 
 
-def rematch(run: MatchingRun) -> MatchingRun:
+def rematch(run: MatchingRun, *, confirmed: bool = False) -> MatchingRun:
     """Match again from a start displaced from the result, if the matcher names rounds for it.
 
     Where an objective is flat, as along the axis of a camera in a straight street, rounds may end
-    before its top. A camera whose second end has a clearly higher z-score is taken from there,
-    unless the ends are so far apart that the camera fails.
+    before its top. A camera whose second end has a clearly higher z-score is taken from there. If
+    the ends are so far apart that the camera would fail, a start displaced from there decides.
     """
-    tracking = run.matcher.tracking_rounds
+    tracking, findings = run.matcher.tracking_rounds, run.correspondences.findings
     if not tracking or not run.solution.objective.uses_correspondences:
         return run
+    run = run if confirmed else follow_neighbours(run)
     ended, rig = run.solution.T_camera_lidar, run.solution.solved_rig
     seed = run.solution.config.seed
     start = perturb(rig, rotation_deg=REMATCH_DEG, translation_m=REMATCH_M, seed=seed)
@@ -189,30 +192,54 @@ def rematch(run: MatchingRun) -> MatchingRun:
             return run
         ends = again.solution.T_camera_lidar
         run = replace(run, rematch={name: (T, ends[name]) for name, T in ended.items()})
-        near = [
-            (name,)
-            for name, checks in compare_ends(run).items()
-            if all(check.status != "FAIL" for check in checks)
-            and name in run.correspondences.findings.z_score
-        ]
-        better = better_cameras(run, again, near, ratio=_BETTER)
-        return with_cameras_of(run, again, better) if better else run
+        lost = {*findings.missed, *again.solution.held}
+        found = [(name,) for name in findings.z_score if name not in lost]
+        better = better_cameras(run, again, found, ratio=_BETTER)
+        if not better:
+            return run
+        apart = compare_ends(run)
+        far = any(check.status == "FAIL" for name in better for check in apart[name])
+        run = with_cameras_of(run, again, better)
+        return rematch(run, confirmed=True) if far and not confirmed else run
     except CorrespondenceError as error:
         both = {name: (T, T) for name, T in ended.items()}
         return replace(run, rematch=both, rematch_failure=str(error))
+
+
+def follow_neighbours(run: MatchingRun) -> MatchingRun:
+    """Match again from where most cameras have gone, those that have left them.
+
+    Where more than half of the cameras keep the relative poses of the guess, the others may have
+    ended at a wrong optimum. They start again where the guess has them beside these, and the end at
+    which images and clouds agree better is taken.
+    """
+    guess, ended = run.guess.T_camera_lidar, run.solution.T_camera_lidar
+    moves = [invert(guess[name]) @ T for name, T in ended.items()]  # of the cloud, by each camera
+    placed = [{name: guess[name] @ move for name in ended} for move in moves]
+    left = [[n for n, T in of.items() if not are_same_pose(T, ended[n])] for of in placed]
+    fewest = min(range(len(left)), key=lambda k: len(left[k]))
+    astray = left[fewest]
+    if not 0 < len(astray) < len(ended) / 2:
+        return run
+    start = run.solution.solved_rig.moved_to({name: placed[fewest][name] for name in astray})
+    rounds = (0, *run.matcher.tracking_rounds)
+    with suppress(CorrespondenceError):
+        again = run_again(run, start, rounds)
+        if again and (better := better_cameras(run, again, [(name,) for name in astray])):
+            _log.info("beside their neighbours images and clouds agree better: %s", better)
+            return with_cameras_of(run, again, better)
+    return run
 
 
 def run_again(
     run: MatchingRun,
     start: Rig,
     rounds: Sequence[int],
-    *,
-    solve: Callable[..., Solution] = solve_joint,
 ) -> MatchingRun | None:
     """Some rounds and the last one from another start; None if the time is over before their end.
 
     Raises:
-        CorrespondenceError: if a camera gets too few correspondences.
+        CorrespondenceError: if all cameras get too few correspondences.
     """
     settings, places = (run.solution.config, run.solution.terms), run.correspondences.places
     indices = [*dict.fromkeys((*rounds, run.matcher.rounds - 1))]
@@ -231,7 +258,7 @@ def run_again(
         start,
         indices,
         match,
-        lambda at, table: solve(at.with_lenses_of(run.guess), table, *settings),
+        lambda at, table: solve_without_failing(at.with_lenses_of(run.guess), table, *settings),
     )
     while not run.is_late():
         table, solution, summaries = next(done)

@@ -34,10 +34,10 @@ from calibgraph.model.config import Terms
 from calibgraph.model.geometry import invert, pose_difference, relative_transform
 from calibgraph.model.verdict import TOLERANCE, WENT_ON, Check
 from calibgraph.progress import Progress, no_progress
-from calibgraph.rounds import match_in_rounds, refine_with_camera_pairs
+from calibgraph.rounds import follow_neighbours, match_in_rounds, refine_with_camera_pairs
 from calibgraph.solver.joint import solve_joint, solve_without_failing
 from calibgraph.trust import evidence
-from calibgraph.trust.matcher_checks import going_on_checks
+from calibgraph.trust.matcher_checks import compare_ends, going_on_checks
 from calibgraph.trust.pose_posterior import PosePosterior
 from calibgraph.trust.probability import STRUCTURE, judge
 from factors import Clock, displace
@@ -290,6 +290,79 @@ def test_the_last_round_is_repeated_until_it_stands(data: Dataset, truth: Rig) -
     run = match_in_rounds(data, guess, matcher, Config(), progress=no_progress)
     assert max(moved["moved_deg"] for moved in run.rounds[-1].values()) < 0.1
     assert matcher.calls[:3] == [0, 1, 1] and len(run.rounds) <= 6
+
+
+class Fading(Halfway):
+    """It loses a camera after the first rounds."""
+
+    def match(
+        self, dataset: Dataset, rig: Rig, *, round_index: int, progress: Progress
+    ) -> Correspondences:
+        table = super().match(dataset, rig, round_index=round_index, progress=progress)
+        own = table.camera_index == table.cameras.index("left")
+        return table.select(~own) if len(self.calls) > self.rounds else table
+
+
+def test_a_camera_that_a_second_start_loses_does_not_fail_the_others(
+    data: Dataset, truth: Rig
+) -> None:
+    run = match_in_rounds(data, truth, Fading(truth), Config(), progress=no_progress)
+    assert run.rematch.keys() == truth.cameras.keys() and not run.rematch_failure
+    for name, checks in compare_ends(run).items():
+        assert all(check.status == "PASS" for check in checks) == (name != "left"), name
+
+
+def ended_at(data: Dataset, seen: Rig, z_score: float) -> MatchingRun:
+    """A run with such a z-score of all cameras."""
+    run = matched(data, table_of(seen))
+    run.matcher.tracking_rounds = (0,)
+    of_all = replace(run.correspondences.findings, z_score=dict.fromkeys(seen.cameras, z_score))
+    return replace(run, correspondences=run.correspondences.with_findings(of_all))
+
+
+@pytest.mark.parametrize(("z_score", "taken"), [(9.0, True), (2.0, False)])
+def test_a_far_second_end_that_agrees_better_is_taken_and_tried_again(
+    data: Dataset, truth: Rig, z_score: float, taken: bool
+) -> None:
+    off = perturb(truth, rotation_deg=3.0, translation_m=0.3, seed=1).T_camera_lidar
+    wrong = ended_at(data, truth.moved_to({"left": off["left"]}), 5.0)
+    wrong = replace(wrong, guess=perturb(truth, rotation_deg=3.0, translation_m=0.3, seed=2))
+    right = ended_at(data, truth, z_score)
+    with patch.object(rounds, "run_again", return_value=right) as again:
+        after = rounds.rematch(wrong)
+    assert again.call_count == 1 + taken
+    degrees, _ = pose_difference(
+        after.solution.T_camera_lidar["left"], truth.T_camera_lidar["left"]
+    )
+    assert (degrees < 0.1) == taken
+    assert all(check.status == "PASS" for check in compare_ends(after)["left"]) == taken
+
+
+@pytest.mark.parametrize(("z_score", "found"), [(9.0, True), (2.0, False)])
+def test_a_camera_that_leaves_its_neighbours_is_matched_again_beside_them(
+    data: Dataset, truth: Rig, z_score: float, found: bool
+) -> None:
+    """Two cameras keep the relative pose of the guess, the third is three degrees off."""
+    off = perturb(truth, rotation_deg=3.0, translation_m=0.3, seed=1).T_camera_lidar
+    alone = ended_at(data, truth.moved_to({"left": off["left"]}), 5.0)
+    right = ended_at(data, truth, z_score)
+    with patch.object(rounds, "run_again", return_value=right) as again:
+        after = follow_neighbours(alone)
+    tried = again.call_args.args[1].T_camera_lidar
+    for name, T in truth.T_camera_lidar.items():
+        assert pose_difference(tried[name], T)[0] < 0.1, name
+    degrees, _ = pose_difference(
+        after.solution.T_camera_lidar["left"], truth.T_camera_lidar["left"]
+    )
+    assert (degrees < 0.1) == found
+
+
+def test_cameras_that_scatter_alike_follow_none(data: Dataset, truth: Rig) -> None:
+    """A guess that is off by itself in each camera tells no relative pose."""
+    guess = perturb(truth, rotation_deg=3.0, translation_m=0.3, seed=1)
+    run = replace(ended_at(data, truth, 5.0), guess=guess)
+    with patch.object(rounds, "run_again", side_effect=AssertionError):
+        assert follow_neighbours(run) is run
 
 
 @pytest.mark.usefixtures("no_image_checks")

@@ -272,7 +272,7 @@ def _parse_pose(text: str) -> NDArray[np.float64]:
 
 
 STREET = "street"
-RIG, BEAMS = "kitti", 64  # defaults of simulate_street, but for the rig
+RIG, BEAMS, STEP_M = "kitti", 64, 4.0  # defaults of simulate_street, but for the rig
 _PANEL = "Scenario street"
 
 
@@ -302,6 +302,9 @@ def simulate(
         rich_help_panel=_PANEL,
         help=f"Of the LiDAR. (default: {BEAMS})",
     ),
+    step_m: float | None = Option(
+        None, rich_help_panel=_PANEL, help=f"Mean distance between frames. (default: {STEP_M:g})"
+    ),
 ) -> None:
     """Simulate data with a known truth, reference.yaml, and a displaced guess, rig.yaml."""
     from calibgraph.io.rigs import load_rig
@@ -312,7 +315,7 @@ def simulate(
     common: dict[str, Any] = {
         "frames": frames, "rotation_deg": rotation_deg, "translation_m": translation_m, "seed": seed
     }  # fmt: skip
-    given: dict[str, Any] = {"rig": rig, "beams": beams}
+    given: dict[str, Any] = {"rig": rig, "beams": beams, "step_m": step_m}
     street = {name: value for name, value in given.items() if value is not None}
     with progress_bar() as progress, checked_arguments():
         if scenario == STREET:

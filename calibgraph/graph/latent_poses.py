@@ -125,7 +125,7 @@ class LatentPoseModel:
         """Numbers of the cameras that have correspondences."""
         return [number for number, name in enumerate(self.cameras) if name in self.blocks]
 
-    @property
+    @cached_property
     def paired(self) -> list[int]:
         """Numbers of the cameras that are part of a pair."""
         names = {name for pair in self.pairs for name in (pair.a, pair.b)}
@@ -310,7 +310,8 @@ def _distortion_graph(parts: VarianceComponents) -> gtsam.NonlinearFactorGraph:
     graph.add(gtsam.PriorFactorVector(DISTORTION, np.zeros(size), noise))
     zero, quadratic = gtsam.Values(), (parts.distortion_information, parts.distortion_vector)
     zero.insert(DISTORTION, np.zeros(size))
-    shown = gtsam.HessianFactor(DISTORTION, *quadratic, 0.0)
+    # At a negative error an optimizer would stop.
+    shown = gtsam.HessianFactor(DISTORTION, *quadratic, parts.distortion_constant)
     graph.add(gtsam.LinearContainerFactor(shown, zero))
     return graph
 

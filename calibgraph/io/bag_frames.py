@@ -177,11 +177,13 @@ class FoundFrames(NamedTuple):
             before and after in the recording have the numbers before and after.
         notes: how many there are, how far apart their stamps are, and how many messages were left
             out, and why.
+        late_s: per camera, (n,) times of its images after the instant that a cloud is corrected to.
     """
 
     chosen: tuple[Frame, ...]
     recorded: tuple[Frame, ...]
     notes: tuple[str, ...]
+    late_s: Mapping[str, Array] = {}
 
 
 def frames_of_bag(
@@ -224,9 +226,11 @@ def frames_of_bag(
         )
         for row, cell in zip(complete, cells, strict=True)
     )
+    late_s = dict[str, Array]()
     if options.motion != "none":
-        apart_ns = [after_ns(clouds, stamps[images[n]], pairs[n], complete) for n in cameras]
-        to_s = np.median(apart_ns, axis=0) / _S if apart_ns else np.zeros(len(complete))
+        after_s = {n: after_ns(clouds, stamps[images[n]], pairs[n], complete) / _S for n in cameras}
+        to_s = np.median([*after_s.values()], axis=0) if after_s else np.zeros(len(complete))
+        late_s = {name: own - to_s for name, own in after_s.items()}
         find = motion_finder(path, recorded, options)
         recorded = tuple(
             replace(frame, find_motion=cache(partial(find, frame, float(s))))
@@ -236,7 +240,8 @@ def frames_of_bag(
     if options.every_s:
         of_cells = (np.flatnonzero(cells == cell) for cell in range(len(set(cells))))
         chosen = tuple(recorded[rows[len(rows) // 2]] for rows in of_cells)  # with neighbours
-    return FoundFrames(chosen, recorded, (f"{path}: {summary}{_note(clouds, options.motion)}",))
+    note = f"{path}: {summary}{_note(clouds, options.motion)}"
+    return FoundFrames(chosen, recorded, (note,), late_s)
 
 
 def _read(

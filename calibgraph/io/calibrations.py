@@ -271,6 +271,7 @@ class StatedResult(BaseModel):
     correspondences_sha256: str | None = None
     covariance: dict[str, Covariance | None] = {}
     error_bar_holds: dict[str, StrictBool] = {}
+    verdict: dict[str, Any] = {}
     status: Status | None = Field(None, validation_alias=AliasPath("verdict", "status"))
     of: Reported = Field("alignment", validation_alias=AliasPath("config", "of"))
 

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.errors import DatasetError, FileError
 from calibgraph.io.bag_frames import FoundFrames, frames_of_bag
 from calibgraph.io.bags import BagOptions, is_bag
@@ -139,7 +140,7 @@ def load_dataset(
     data = _without_frames(tuple(path for path in paths if path not in bare) or paths, rig, bag)
     notes = [*data.notes, *(f"{path}: has no clouds; it serves the other bags"
                             for path in sorted(bare))]  # fmt: skip
-    chosen, recorded = list[Frame](), list[Frame]()
+    chosen, recorded, late_s = list[Frame](), list[Frame](), list[Mapping[str, Array]]()
     for path in data.folders:
         prefix = f"{path.name}/" if len(data.folders) > 1 else ""
         start = 1 + max((frame.index for frame in recorded), default=-1)
@@ -152,11 +153,28 @@ def load_dataset(
         chosen += found.chosen
         recorded += found.recorded
         notes += found.notes
+        late_s += [found.late_s] if found.late_s else []
+    if late_s:
+        data, of_times = _with_delays(data, late_s)
+        notes += of_times
     others = () if recorded == chosen else tuple(recorded)
     data = replace(data, frames=tuple(chosen), recorded=others, notes=tuple(notes))
     data = data if frames is None else _complete(data.select(frames))
     of_cloud = data.frames[0].describe_cloud() if data.frames and data.rig.cameras else ()
     return replace(data, notes=(*of_cloud, *data.notes))
+
+
+def _with_delays(data: Dataset, late_s: Sequence[Mapping[str, Array]]) -> tuple[Dataset, list[str]]:
+    """The dataset with time offsets of cameras, by stamps, that its rig does not state; a note."""
+    cameras, found = dict(data.rig.cameras), []
+    for name, camera in cameras.items():
+        median_s = round(float(np.median(np.concatenate([of[name] for of in late_s]))), 6)
+        if camera.time_offset_s is None and median_s:
+            cameras[name] = camera.model_copy(update={"time_offset_s": median_s})
+            found.append(f"{name} {1e3 * median_s:+.1f} ms")
+    rig = data.rig.model_copy(update={"cameras": cameras})
+    note = f"time_offset_s by the stamps, after the corrected clouds: {', '.join(found)}"
+    return replace(data, rig=rig), [note] if found else []
 
 
 def _without_frames(paths: tuple[Path, ...], rig: Rig | None, bag: BagOptions) -> Dataset:

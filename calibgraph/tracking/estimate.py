@@ -134,7 +134,7 @@ class Terms:
             names,
             known,
             seen,
-            np.linalg.cholesky(weighted),
+            np.asarray(np.linalg.cholesky(weighted)),
             spread.least,
             state.ratios.cameras * excess,
             _minimum(state, own, known, weighted),
@@ -313,7 +313,7 @@ class EpochGraph:
         """Information and vector of the closed places but some."""
         frames = self.places.frames.any(axis=1)
         names = self.places.names
-        rows = [row for row in np.flatnonzero(frames) if names[row] not in touched]
+        rows = [row for row in np.flatnonzero(frames).tolist() if names[row] not in touched]
         size = 6 * len(state.names)
         if not rows:
             return np.zeros((size, size)), np.zeros(size)

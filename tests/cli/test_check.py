@@ -44,7 +44,7 @@ def test_a_right_rig_exits_with_0_and_the_json_names_its_units(call: Call) -> No
     content = json.loads(out)
     assert set(content) == {
         "status", "wrong", "tolerance_deg", "tolerance_cm", "frames", "same_recording",
-        "deployed_verdict", "cameras", "lidar", "timings_s",
+        "deployed_verdict", "cameras", "lidar", "lidars", "timings_s",
     }  # fmt: skip
     assert content["status"] == "OK"
     assert content["wrong"] == []

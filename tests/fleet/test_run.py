@@ -157,7 +157,7 @@ def test_rows_are_what_solve_gives(
     for camera, T in result.T_camera_lidar.items():
         row, verdict = alone[GOOD[1], camera], result.camera_verdicts[camera]
         found = row["verdict"], row["cannot_tell"], row["of"], row["batch"], row["mileage_km"]
-        assert found == (verdict.status, verdict.cannot_tell, "alignment", "1", 1000)
+        assert found == (verdict.status, verdict.cannot_tell, "alignment", 1, 1000)
         assert verdict.error_probability is not None
         probability = verdict.error_probability.probability
         assert row["probability_off"] == pytest.approx(probability, rel=1e-3)

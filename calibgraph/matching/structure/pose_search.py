@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from calibgraph.arrays import Array
 from calibgraph.matching.structure.acceptance import (
     FALSE_ACCEPTANCE,
     FEW_FRAMES,
@@ -274,7 +275,12 @@ class PoseSearch:
 
 def is_same_pose(one: Body, two: Body) -> bool:
     """Whether two poses of a body are so near that refinements and rounds end alike."""
-    degrees, centimetres = pose_difference(lead(one).T_camera_lidar, lead(two).T_camera_lidar)
+    return are_same_pose(lead(one).T_camera_lidar, lead(two).T_camera_lidar)
+
+
+def are_same_pose(T_one: Array, T_two: Array) -> bool:
+    """The same of two (4, 4) T_camera_lidar."""
+    degrees, centimetres = pose_difference(T_one, T_two)
     return degrees < SAME_DEG and centimetres < SAME_CM
 
 

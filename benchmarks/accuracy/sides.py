@@ -1,0 +1,186 @@
+"""What side cameras are worth: six cameras all round a vehicle, rendered standing and moving.
+
+    python -m benchmarks.accuracy.sides --groups 0:1 --kinds standing,swept
+    python -m benchmarks.accuracy.sides --summary out/sides.jsonl
+
+A group is a rig with errors of its own and five streets that it drives through, three frames each:
+one place. All kinds have the same images, of one instant, and clouds that differ: ``standing``;
+``swept``, at 10 m/s and not corrected; ``corrected``, the same by the times of its points;
+``one_distance``, standing, with the points alone that are 7 to 12 m away and above the ground.
+Starts are 2 degrees and 10 cm off. Errors are of the alignment of the cloud that stands.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.accuracy import ledger
+from benchmarks.accuracy.error_bars import (
+    FRAMES,
+    STEP_M,
+    STREETS,
+    group_parser,
+    load_streets,
+    solve_streets,
+)
+from benchmarks.accuracy.ledger import Key, Record
+from benchmarks.tables import Table
+from calibgraph import Intrinsics, Rig, calibrate, load_dataset, load_rig, perturb
+from calibgraph.simulation.lidar import lidar_of, ring_gains, scan
+from calibgraph.simulation.recording import build_drive
+from calibgraph.simulation.rigs import rig_of
+from calibgraph.simulation.scan_errors import ScanErrors, draw_scan_errors
+from tools.scenes.lens_errors import draw_lens_errors
+from tools.scenes.sensor_streets import ALIGNMENT, aligned_rig, render
+
+BEAMS = 64
+TURN_M = 1.0  # driven during a turn: 10 m/s at 10 Hz
+KINDS = "standing", "swept", "corrected", "one_distance"
+SWEPT = "swept", "corrected"
+WHERE = {"front": "front", "front_left": "front sides", "front_right": "front sides",
+         "back_left": "back sides", "back_right": "back sides", "back": "back"}  # fmt: skip
+
+
+def main() -> None:
+    """Render, calibrate, keep a line of each."""
+    parser = group_parser(__doc__, "sides", [0, 2])
+    parser.set_defaults(scenes=parser.get_default("scenes").with_name("sides"))
+    parser.add_argument("--kinds", default=",".join(KINDS))
+    parser.add_argument("--streets", type=int, default=STREETS)
+    arguments = parser.parse_args()
+    cases = [
+        Key("scene", kind, f"{arguments.size:g}", STREETS * group + street)
+        for group in range(*arguments.groups)
+        for street in range(arguments.streets)
+        for kind in arguments.kinds.split(",")
+    ]
+    work = partial(run_case, scenes=arguments.scenes)
+    records = ledger.records_of(arguments, cases, work)
+    ledger.publish_cases([report(records), *together(records, arguments.scenes)], records)
+
+
+def six_cameras() -> Rig:
+    """The rig ``surround`` with images of half the size."""
+    cameras = {}
+    for name, camera in rig_of("surround").cameras.items():
+        k = camera.intrinsics_px
+        half = {side: getattr(k, side) / 2 for side in ("fx", "fy")}
+        half |= {side: (getattr(k, side) - 0.5) / 2 for side in ("cx", "cy")}
+        size = {"width_px": camera.width_px // 2, "height_px": camera.height_px // 2}
+        cameras[name] = camera.model_copy(update={**size, "intrinsics_px": Intrinsics(**half)})
+    return Rig(cameras=cameras)
+
+
+def run_case(case: Key, scenes: Path) -> Record:
+    """Make the data of a kind, calibrate, keep the tables beside them."""
+    size, group, kind = float(case.data), case.seed // STREETS, case.kind
+    truth, root = six_cameras(), scenes / f"scene_{case.seed}"
+    stated = draw_lens_errors(truth, size / 2, np.random.default_rng([13, group]))
+    still = replace(draw_scan_errors(BEAMS, size, np.random.default_rng([7, group])), motion_m=0.0)
+    first, folder = root / "standing", root / kind
+    if not (first / ALIGNMENT).exists():
+        drive = {"frames": FRAMES, "step_m": STEP_M, "seed": 7000 + case.seed}
+        render(first, truth, BEAMS, still, **drive)
+        aligned_rig(truth, stated, first, BEAMS, still).save(first / ALIGNMENT)
+    if not folder.exists():
+        _derive(folder, first, still, case)
+    aligned = load_rig(first / ALIGNMENT)
+    for rig, name in ((stated, "reference.yaml"), (aligned, ALIGNMENT)):
+        rig.save(folder / name)
+    guess = perturb(stated, rotation_deg=2.0, translation_m=0.1, seed=case.seed)
+    guess.save(folder / "rig.yaml")
+    result = calibrate(load_dataset(folder), guess)
+    assert result.correspondences is not None
+    result.correspondences.save(folder / "correspondences.parquet")
+    if result.camera_matches is not None:
+        result.camera_matches.save(folder / "camera_matches.parquet")
+    result.rig.save(folder / "result.yaml")
+    return ledger.to_record(result, aligned)
+
+
+def _derive(folder: Path, first: Path, still: ScanErrors, case: Key) -> None:
+    """The images of the street that is rendered, with other clouds."""
+    (folder / "lidar").mkdir(parents=True)
+    (folder / "cameras").symlink_to(os.path.relpath(first / "cameras", folder))
+    clouds = [np.load(path) for path in sorted((first / "lidar").glob("*.npy"))]
+    if case.kind in SWEPT:
+        drive = build_drive(frames=FRAMES, step_m=STEP_M, seed=7000 + case.seed, vary_layout=True)
+        lidar = replace(lidar_of(BEAMS), errors=replace(still, motion_m=TURN_M))
+        gains = ring_gains(lidar, np.random.default_rng([case.seed, 2]))
+        clouds = [
+            scan(drive.world, lidar, gains, T, rng=np.random.default_rng([case.seed, 3, frame]))
+            for frame, T in enumerate(drive.T_world_lidar)
+        ]
+    change = {"corrected": _at_one_instant, "one_distance": _walls}.get(case.kind, np.asarray)
+    for frame, cloud in enumerate(clouds):
+        np.save(folder / "lidar" / f"{frame:06d}.npy", change(cloud))
+
+
+def _at_one_instant(cloud: np.ndarray) -> np.ndarray:
+    """The points of a sweep where the LiDAR at the instant of the images sees them."""
+    moved = cloud.copy()
+    moved[:, 0] += TURN_M * np.arctan2(cloud[:, 1], cloud[:, 0]) / (2 * np.pi)
+    return moved
+
+
+def _walls(cloud: np.ndarray) -> np.ndarray:
+    """The points above the ground that are 7 to 12 m away."""
+    away = np.hypot(cloud[:, 0], cloud[:, 1])
+    return np.asarray(cloud[(away > 7.0) & (away < 12.0) & (cloud[:, 2] > -1.5)])  # noqa: PLR2004
+
+
+COLUMNS = (
+    "cameras", "results", "error, median [deg]", "largest", "[cm]", "largest", "within",
+    "sigma, median [deg]", "[cm]", "mean NEES / 6", "PASS, WARN, FAIL",
+)  # fmt: skip
+
+
+def _cells(found: Sequence[Record], within: tuple[float, float]) -> tuple[str, ...]:
+    deg, cm = (np.array([one[f"error_{unit}"] for one in found]) for unit in ("deg", "cm"))
+    bars = np.array([np.sqrt(np.diag(one["covariance"])) for one in found if one["covariance"]])
+    sigma = np.median(bars.reshape(-1, 2, 3).max(axis=2), axis=0) * (np.degrees(1.0), 100.0)
+    nees = [one["normalised_squared"] for one in found if one["covariance"]]
+    status = [one["status"] for one in found]
+    inside = ((deg <= within[0]) & (cm <= within[1])).sum()
+    return (
+        str(len(found)), f"{np.median(deg):.3f}", f"{deg.max():.2f}", f"{np.median(cm):.1f}",
+        f"{cm.max():.1f}", str(inside), f"{sigma[0]:.3f}", f"{sigma[1]:.1f}",
+        f"{np.mean(nees):.2f}", ", ".join(str(status.count(s)) for s in ("PASS", "WARN", "FAIL")),
+    )  # fmt: skip
+
+
+def report(records: Sequence[Record]) -> Table:
+    """A row per kind and kind of camera, of single places; within 0.15 deg and 5 cm."""
+    groups: dict[tuple[str, str], list[Record]] = {}
+    for record in records:
+        for name, camera in record.get("cameras", {}).items():
+            groups.setdefault((record["kind"], WHERE[name]), []).append(camera)
+    rows = tuple((*key, *_cells(of, (0.15, 5.0))) for key, of in sorted(groups.items()))
+    return Table("One street of three frames, errors and bars per camera", ("", *COLUMNS), rows)
+
+
+def together(records: Sequence[Record], scenes: Path) -> list[Table]:
+    """The same of the five streets of a group together; within 0.08 deg and 2 cm."""
+    groups: dict[tuple[str, str], list[Record]] = {}
+    streets: dict[tuple[str, int], list[Path]] = {}
+    for record in sorted(records, key=lambda record: record["seed"]):
+        if "cameras" in record:
+            key = record["kind"], record["seed"] // STREETS
+            streets.setdefault(key, []).append(scenes / f"scene_{record['seed']}" / record["kind"])
+    for (kind, _), folders in streets.items():
+        if len(folders) == STREETS:
+            found = [one for of, one in solve_streets(load_streets(folders)) if of == "camera"]
+            for name, one in zip(WHERE, found, strict=True):
+                groups.setdefault((kind, WHERE[name]), []).append(one)
+    rows = tuple((*key, *_cells(of, (0.08, 2.0))) for key, of in sorted(groups.items()))
+    return [Table("Five streets together", ("", *COLUMNS), rows)]
+
+
+if __name__ == "__main__":
+    main()
