@@ -156,16 +156,6 @@ class ProjectionBlock(RobustBlock):
         runs = np.tile(self._whole, (len(T_camera_lidar), 1))
         return self.packed_run_sums(T_camera_lidar, runs, wanted=COST)[:, 27]
 
-    def frame_sums(
-        self, T_lidar_camera: gtsam.Pose3, edges: ArrayLike, *, curvature: bool = False
-    ) -> BlockSums:
-        """H, b and c of each run ``edges[i]:edges[i + 1]`` of the correspondences, stacked.
-
-        With ``curvature``, also the second derivative of half the cost of each.
-        """
-        poses, runs = _T_camera_lidar(T_lidar_camera)[None], to_runs(np.asarray(edges, np.int64))
-        return self.summarize(poses, runs, curvature=curvature)
-
     def summarize(
         self,
         T_camera_lidar: Array,

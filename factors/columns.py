@@ -16,7 +16,7 @@ where it is reported, one behind is half of the motion off.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from factors import kernel
-from factors.lens import Lens
+from factors.lens import Lens, LensModel
 from factors.lens_kernels import EQUIRECTANGULAR, FISHEYE, OMNIDIRECTIONAL, PINHOLE
 
 Array = NDArray[np.float64]
@@ -47,10 +47,10 @@ _NUMBERS = {name: number for number, name in enumerate(LENS)} | {
     "p2": kernel.P2,
     **{f"k{power}": kernel.P2 + power for power in range(1, 5)},
 }
-_MAKERS: Mapping[int, tuple[Callable[..., Lens], int]] = {
-    PINHOLE: (Lens.pinhole, 8),
-    FISHEYE: (Lens.fisheye, 4),
-    OMNIDIRECTIONAL: (Lens.omnidirectional, 5),
+_MODELS: Mapping[int, tuple[LensModel, int]] = {
+    PINHOLE: ("pinhole", 8),
+    FISHEYE: ("fisheye", 4),
+    OMNIDIRECTIONAL: ("omnidirectional", 5),
 }
 _SMALL_RAD = 1e-4  # of turn, below which the series are as exact
 
@@ -177,9 +177,9 @@ class Columns:
         packed[2:4] += steps.get(CENTRE_X, 0.0), steps.get(CENTRE_Y, 0.0)
         for name, number in COEFFICIENT_NUMBERS[self.lens.kind].items():
             packed[4 + number] += steps.get(name, 0.0)
-        make, size = _MAKERS[self.lens.kind]
+        model, size = _MODELS[self.lens.kind]
         named = dict(zip(("fx", "fy", "cx", "cy"), packed.tolist(), strict=False))
-        return make(**named, distortion=packed[4 : 4 + size].tolist())
+        return Lens.of(model, **named, distortion=packed[4 : 4 + size].tolist())
 
     def clock_at(self, values: Array) -> Clock:
         """The clock of (k,) values."""

@@ -11,7 +11,7 @@ instead of a NaN or a wrong small one. :func:`unproject` is the inverse, for any
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from typing import Any, Literal
@@ -60,7 +60,7 @@ _SINGULAR = 1e-9  # determinant over the square of the trace, at the limit of a 
 
 @dataclass(frozen=True, eq=False)
 class Lens:
-    """A lens, packed for the kernels. Build it with one of its static methods.
+    """A lens, packed for the kernels. Build it with :meth:`of`.
 
     Attributes:
         kind: of ``lens_kernels``: PINHOLE, FISHEYE, OMNIDIRECTIONAL or EQUIRECTANGULAR.
@@ -73,56 +73,30 @@ class Lens:
     packed: Array
 
     @staticmethod
-    def pinhole(
-        *, fx: float, fy: float, cx: float, cy: float, distortion: Sequence[float] = ()
+    def of(
+        model: LensModel,
+        *,
+        fx: float,
+        fy: float,
+        cx: float,
+        cy: float,
+        distortion: Sequence[float] = (),
     ) -> Lens:
-        """Pinhole with OpenCV's radial-tangential distortion: 0, 4, 5 or 8 coefficients.
+        """A lens of a model, with OpenCV's coefficients in the order of ``ORDERS``.
+
+        ``pinhole`` has OpenCV's radial-tangential distortion; ``fisheye`` is Kannala and Brandt's
+        (OpenCV ``fisheye``, Kalibr and ROS ``equidistant``); ``omnidirectional`` is the unified
+        model of Mei (OpenCV ``omnidir``, Kalibr ``omni-radtan``), with 0 <= xi. A panorama,
+        ``equirectangular``, has u = fx longitude + cx, v = fy latitude + cy, right and down are
+        positive; a whole one of width W has fx = W / (2 pi), and its columns go round.
 
         Raises:
             ValueError: on another number of coefficients, or a focal length that is not positive.
         """
-        coefficients = _checked(fx, fy, distortion, "pinhole")
-        limit = _radtan_limit(tuple(coefficients.tolist()))
-        return Lens(PINHOLE, np.array([fx, fy, cx, cy, *coefficients, limit], dtype=np.float64))
-
-    @staticmethod
-    def fisheye(*, fx: float, fy: float, cx: float, cy: float, distortion: Sequence[float]) -> Lens:
-        """Kannala-Brandt fisheye (OpenCV ``fisheye``, Kalibr and ROS ``equidistant``).
-
-        Raises:
-            ValueError: unless there are 4 coefficients and positive focal lengths.
-        """
-        coefficients = _checked(fx, fy, distortion, "fisheye")
-        limit = _fisheye_limit(coefficients)
-        return Lens(FISHEYE, np.array([fx, fy, cx, cy, *coefficients, limit], dtype=np.float64))
-
-    @staticmethod
-    def omnidirectional(
-        *, fx: float, fy: float, cx: float, cy: float, distortion: Sequence[float]
-    ) -> Lens:
-        """The unified model of Mei (OpenCV ``omnidir``, Kalibr ``omni-radtan``): xi k1 k2 p1 p2.
-
-        Raises:
-            ValueError: unless there are 5 coefficients, positive focal lengths and 0 <= xi.
-        """
-        coefficients = _checked(fx, fy, distortion, "omnidirectional")
-        check_mirror(coefficients[0])
-        limit = _omnidirectional_limit(coefficients)
-        return Lens(OMNIDIRECTIONAL, np.array([fx, fy, cx, cy, *coefficients, limit]))
-
-    @staticmethod
-    def equirectangular(
-        *, fx: float, fy: float, cx: float, cy: float, distortion: Sequence[float] = ()
-    ) -> Lens:
-        """A panorama: u = fx longitude + cx, v = fy latitude + cy; right and down are positive.
-
-        A whole one of width W has fx = W / (2 pi), and its columns go round.
-
-        Raises:
-            ValueError: if there is distortion, or a focal length that is not positive.
-        """
-        coefficients = _checked(fx, fy, distortion, "equirectangular")
-        return Lens(EQUIRECTANGULAR, np.array([fx, fy, cx, cy, *coefficients, math.pi]))
+        coefficients = _checked(fx, fy, distortion, model)
+        kind, limit_of = _KINDS[model]
+        packed = [fx, fy, cx, cy, *coefficients, limit_of(tuple(coefficients.tolist()))]
+        return Lens(kind, np.array(packed, dtype=np.float64))
 
     @property
     def is_undistorted_pinhole(self) -> bool:
@@ -203,9 +177,9 @@ def _radtan_limit(coefficients: tuple[float, ...]) -> float:
     return min(root, _MAX_PLANE_RADIUS)
 
 
-def _fisheye_limit(coefficients: Array) -> float:
+def _fisheye_limit(coefficients: tuple[float, ...]) -> float:
     """Field angle at which the distorted angle stops growing, at most just under 180 degrees."""
-    slope = np.array([1.0, *(coefficients[:4] * [3.0, 5.0, 7.0, 9.0])])
+    slope = np.array([1.0, *np.multiply(coefficients[:4], [3.0, 5.0, 7.0, 9.0])])
     return min(math.sqrt(_smallest_positive_root(slope)), math.radians(179.0))
 
 
@@ -236,13 +210,14 @@ def check_mirror(xi: float) -> None:
         raise ValueError(f"xi of the unified model is {xi:g}, expected 0 to {_MAX_XI:g}")
 
 
-def _omnidirectional_limit(coefficients: Array) -> float:
+def _omnidirectional_limit(coefficients: tuple[float, ...]) -> float:
     """Field angle [rad] up to which the unified model is one-to-one, without tangential terms.
 
     At the least of the angles at which the plane's radius stops growing (arccos(-1 / xi), xi > 1),
     at which the polynomial does, and at which the radius equals a pinhole's at 85 degrees.
     """
     xi, k1, k2 = coefficients[:3]
+    check_mirror(xi)
     slope = np.array([1.0, 3.0 * k1, 5.0 * k2])
     radius = min(_MAX_PLANE_RADIUS, math.sqrt(_smallest_positive_root(slope)))
     # sin(t) / (cos(t) + xi) = radius:  sin(t - atan(radius)) = xi radius / sqrt(1 + radius^2).
@@ -250,6 +225,15 @@ def _omnidirectional_limit(coefficients: Array) -> float:
     if sine >= 1.0:
         return math.acos(-1.0 / xi)
     return math.atan(radius) + math.asin(sine)
+
+
+_KINDS: dict[LensModel, tuple[int, Callable[[tuple[float, ...]], float]]] = {
+    "pinhole": (PINHOLE, _radtan_limit),
+    "fisheye": (FISHEYE, _fisheye_limit),
+    "omnidirectional": (OMNIDIRECTIONAL, _omnidirectional_limit),
+    "equirectangular": (EQUIRECTANGULAR, lambda _: math.pi),
+}
+"""The kind of each model, and the limit of its domain by its coefficients."""
 
 
 def _first_omnidirectional_rays(packed: Array, points: Array) -> Array:

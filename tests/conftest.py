@@ -60,10 +60,16 @@ KANNALA = (0.02, -0.004, 0.001, -0.0002)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Files with slow tests come first: at the end one process would wait for the other.
 
-    Then those of ``vehicle``: processes that share the last files each make what is made once.
+    Then ``io``, which compiles next to nothing, while the other process, which begins behind it,
+    compiles kernels for both; and ``vehicle``, whose results only one process should make.
     """
     slow = {item.path for item in items if item.get_closest_marker("slow")}
-    items.sort(key=lambda item: (item.path not in slow, item.path.parent.name != "vehicle"))
+    early = {"io": 0, "vehicle": 1}
+
+    def place(item: pytest.Item) -> tuple[bool, int]:
+        return item.path not in slow, early.get(item.path.relative_to(ROOT).parts[1], 2)
+
+    items.sort(key=place)
 
 
 def pytest_collection_finish() -> None:

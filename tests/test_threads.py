@@ -66,7 +66,7 @@ def test_another_thread_goes_on_while_a_kernel_runs() -> None:
     """If the kernel held the GIL, the other thread would make no turn until its end."""
     rng = np.random.default_rng(0)
     points = rng.uniform((-3, -2, 4), (3, 2, 30), (300_000, 3))
-    lens = Lens.pinhole(fx=700.0, fy=700.0, cx=600.0, cy=200.0)
+    lens = Lens.of("pinhole", fx=700.0, fy=700.0, cx=600.0, cy=200.0)
     block = ProjectionBlock(lens, points, lens.project(points)[0], scale=2.0)
     runs, T = np.tile([0, len(points)], (40, 1)), np.eye(4)[None]
     block.run_sums(T, runs[:1])  # compiled

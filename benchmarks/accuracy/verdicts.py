@@ -10,7 +10,7 @@ the cases per kind, of simulated correspondences and of images and clouds: from 
 stopped run continues with the same command. Scenes are simulated beforehand, 20 s each:
 
     for i in 0 1 2 3 4 5; do
-        calibgraph simulate street --rig sample --beams 32 --frames 8 \
+        calibgraph simulate street --rig sample --beams 32 --frames 8 --step-m 5 \
             --seed $((100 + i)) --out out/scenes/scene_$i; done
 
 A result is off beyond 0.5 deg or 10 cm, and right within 0.15 deg and 4 cm, of ``evaluate``'s E_R

@@ -15,8 +15,9 @@ import numpy as np
 from benchmarks.paper.draws import METHODS, TRF_TERMS, Source, run_methods
 from calibgraph.errors import CorrespondenceError
 from calibgraph.model.config import Config
+from calibgraph.model.geometry import to_T_lidar_camera
 from calibgraph.model.metrics import evaluate
-from calibgraph.solver.matches import BlockResiduals, camera_blocks
+from calibgraph.solver.matches import camera_blocks
 
 Numbers = dict[str, dict[str, float]]
 """Per camera, or per pair ``A->B`` of neighbours: metrics by name, without signs."""
@@ -96,9 +97,8 @@ def run_draw(source: Source, task: tuple[int, int], *, config: Config, trf: bool
         metrics = {name: {metric: abs(value) for metric, value in asdict(error).items()}
                    for name, error in {**errors.cameras, **kept}.items()}  # fmt: skip
         for name, block in blocks.items():
-            metrics[name][REPROJECTION] = float(
-                np.median(BlockResiduals.at(T[name], block).errors_px)
-            )
+            residuals, _ = block.block.residuals(to_T_lidar_camera(T[name]))
+            metrics[name][REPROJECTION] = float(np.median(np.hypot(*residuals.T)))
         found[row] = metrics, seconds
     return found
 

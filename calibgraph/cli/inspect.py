@@ -219,22 +219,29 @@ def export(
         metavar='"X Y Z ROLL PITCH YAW"',
         help="Of autoware: the LiDAR in sensor_kit_base_link, metres and radians. (default: at 0)",
     ),
+    deployed: Path | None = Option(
+        None,
+        metavar="FILE",
+        help="Of autoware: the sensor_kit_calibration.yaml in use. Only calibrated rows change, "
+        "which is printed.",
+    ),
     even_if_failed: bool = Option(False, "--even-if-failed", help="Also with the verdict FAIL."),
     force: options.Force = False,
 ) -> None:
     """Write a calibration in the format of another program, with its direction as a comment."""
     import numpy as np
 
-    from calibgraph.io.formats.export import export_calibration
+    from calibgraph.io.formats.export import describe_changes, export_calibration, read_kit
     from calibgraph.io.rigs import load_rig
     from calibgraph.model.plausibility import MAX_DISTANCE_M, find_implausible
 
     with checked_arguments(), progress_bar("writing"):
         T_base_lidar = None if lidar_pose is None else _parse_pose(lidar_pose)
+        before = {} if deployed is None else read_kit(deployed)
         written = export_calibration(
             source, out, format, cameras=camera or None, lidar_frame=lidar_frame,
-            camera_frame=camera_frame, T_base_lidar=T_base_lidar, even_if_failed=even_if_failed,
-            force=force,
+            camera_frame=camera_frame, T_base_lidar=T_base_lidar, deployed=deployed,
+            even_if_failed=even_if_failed, force=force,
         )  # fmt: skip
         rig = load_rig(source)
     rig = rig.model_copy(
@@ -243,6 +250,7 @@ def export(
     if T_base_lidar is not None and np.linalg.norm(T_base_lidar[:3, 3]) > MAX_DISTANCE_M:
         print_line(f"warning: --lidar-pose {lidar_pose!r}: lengths in millimetres?")
     lines = [f"warning: {line}" for line in find_implausible(rig)]
+    lines += describe_changes(before, read_kit(out)) if before else []
     for line in [*lines, *(f"{path}: written ({format})" for path in written)]:
         print_line(line)
 
@@ -264,7 +272,7 @@ def _parse_pose(text: str) -> NDArray[np.float64]:
 
 
 STREET = "street"
-RIG, BEAMS = "kitti", 64  # defaults of simulate_street, but for the rig
+RIG, BEAMS, STEP_M = "kitti", 64, 4.0  # defaults of simulate_street, but for the rig
 _PANEL = "Scenario street"
 
 
@@ -294,6 +302,9 @@ def simulate(
         rich_help_panel=_PANEL,
         help=f"Of the LiDAR. (default: {BEAMS})",
     ),
+    step_m: float | None = Option(
+        None, rich_help_panel=_PANEL, help=f"Mean distance between frames. (default: {STEP_M:g})"
+    ),
 ) -> None:
     """Simulate data with a known truth, reference.yaml, and a displaced guess, rig.yaml."""
     from calibgraph.io.rigs import load_rig
@@ -304,7 +315,7 @@ def simulate(
     common: dict[str, Any] = {
         "frames": frames, "rotation_deg": rotation_deg, "translation_m": translation_m, "seed": seed
     }  # fmt: skip
-    given: dict[str, Any] = {"rig": rig, "beams": beams}
+    given: dict[str, Any] = {"rig": rig, "beams": beams, "step_m": step_m}
     street = {name: value for name, value in given.items() if value is not None}
     with progress_bar() as progress, checked_arguments():
         if scenario == STREET:

@@ -45,16 +45,13 @@ def serve(
     host_name: list[str] | None = Option(
         None, metavar="NAME", help="Name the server is called by; may be repeated."
     ),
-    root: list[str] | None = Option(
-        None, metavar="URI", help="Folder that jobs may read from; may be repeated."
-    ),
     jobs: int | None = Option(None, min=0, help="Jobs at once. (default: one per core)"),
     timeout_s: float = Option(3600.0, min=0.001, metavar="SECONDS", help="Longest time of a job."),
     memory_gb: float = Option(
         8.0, min=0.1, metavar="GB", help="Most memory of a job, and of a process with trackers."
     ),
     recording_gb: float = Option(
-        20.0, min=0.001, metavar="GB", help="Largest upload, unpacked too, and remote recording."
+        20.0, min=0.001, metavar="GB", help="Largest upload, unpacked too."
     ),
     free_gb: float = Option(1.0, min=0.0, metavar="GB", help="With less on the disk, refuse jobs."),
     keep_days: float = Option(30.0, min=0.001, metavar="DAYS", help="How long results are kept."),
@@ -80,7 +77,6 @@ def serve(
         data=data,
         tokens=tokens,
         hosts=tuple(host_name or ()),
-        roots=tuple(root or ()),
         job_timeout_s=timeout_s,
         memory_bytes=int(memory_gb * _GB),
         recording_bytes=int(recording_gb * _GB),

@@ -125,7 +125,7 @@ def fetch(uri: str, folder: Path, most_bytes: float) -> Path:
         raise FileError(uri, "nothing is there; check the address")
     size = sum(filesystem.du(path, total=False).values())
     if size > most_bytes:
-        most = f"{most_bytes / 1e9:.3g} (--fetch-gb of fleet, --recording-gb of serve)"
+        most = f"{most_bytes / 1e9:.3g} (--fetch-gb)"
         raise FileError(uri, f"{size / 1e9:.3g} GB, expected up to {most}")
     name = path.rstrip("/").rsplit("/", 1)[-1] or "recording"
     target = folder / name

@@ -48,6 +48,12 @@ class VarianceComponents:
     distortion_size: float | Array = 1.0
     robust_scale: float = np.inf
 
+    @property
+    def distortion_constant(self) -> float:
+        """That of the quadratic by the residuals, with which it has no negative value."""
+        vector = self.distortion_vector
+        return float(vector @ np.linalg.pinv(self.distortion_information) @ vector)
+
 
 @dataclass(frozen=True)
 class VarianceRatios:
@@ -86,4 +92,5 @@ def least_cost_of_distortion(parts: VarianceComponents) -> float:
     """Twice the error of both factors of the distortion by itself, at its minimum."""
     vector = parts.distortion_vector
     prior = np.diag(1.0 / np.broadcast_to(parts.distortion_size, len(vector)))
-    return -float(vector @ np.linalg.solve(prior + parts.distortion_information, vector))
+    least = vector @ np.linalg.solve(prior + parts.distortion_information, vector)
+    return parts.distortion_constant - float(least)

@@ -125,7 +125,7 @@ class LatentPoseModel:
         """Numbers of the cameras that have correspondences."""
         return [number for number, name in enumerate(self.cameras) if name in self.blocks]
 
-    @property
+    @cached_property
     def paired(self) -> list[int]:
         """Numbers of the cameras that are part of a pair."""
         names = {name for pair in self.pairs for name in (pair.a, pair.b)}
@@ -308,11 +308,10 @@ def _distortion_graph(parts: VarianceComponents) -> gtsam.NonlinearFactorGraph:
     graph, size = gtsam.NonlinearFactorGraph(), parts.distortion_jacobian.shape[2]
     noise = gtsam.noiseModel.Diagonal.Variances(np.broadcast_to(parts.distortion_size, size))
     graph.add(gtsam.PriorFactorVector(DISTORTION, np.zeros(size), noise))
-    information, vector = parts.distortion_information, parts.distortion_vector
-    zero, least = gtsam.Values(), float(vector @ np.linalg.pinv(information) @ vector)
+    zero, quadratic = gtsam.Values(), (parts.distortion_information, parts.distortion_vector)
     zero.insert(DISTORTION, np.zeros(size))
-    # With this constant no error is negative, at which an optimizer would stop.
-    shown = gtsam.HessianFactor(DISTORTION, information, vector, least)
+    # At a negative error an optimizer would stop.
+    shown = gtsam.HessianFactor(DISTORTION, *quadratic, parts.distortion_constant)
     graph.add(gtsam.LinearContainerFactor(shown, zero))
     return graph
 

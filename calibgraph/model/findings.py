@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cache
@@ -12,11 +11,10 @@ from importlib.resources import files
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, PlainValidator, TypeAdapter, ValidationError
+from pydantic import Field, TypeAdapter, ValidationError
 
 from calibgraph.errors import CorrespondenceError
 from calibgraph.files import describe
-from calibgraph.yaml_text import describe_value
 
 _OF_ONE_SEARCH = ("found", "missed", "chance")
 _PER_CAMERA = (
@@ -29,26 +27,16 @@ STAGE1 = "stage1"
 _COMMON = {"systematic_rotation_rad", "systematic_translation_m"}
 
 
-def _number(least: float, largest: float, words: str = "") -> PlainValidator:
-    """A check that a value is a number in a range, which the message states."""
-    expected = words or f"a number from {least:g} to {largest:.3g}"
-
-    def check(value: Any) -> float:
-        is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
-        if is_number and least <= value <= largest:
-            return float(value)
-        raise ValueError(
-            f"expected {expected}, found {describe_value(value)}; correct it, or leave it out"
-        )
-
-    return PlainValidator(check)
+def _up_to(largest: float) -> Any:
+    """A check that a number is in a range from zero."""
+    return Field(strict=True, ge=0, le=largest)
 
 
 _Number = Annotated[float, Field(strict=True)]
-_Finite = Annotated[float, _number(-sys.float_info.max, sys.float_info.max, "a finite number")]
-_Angle = Annotated[float, _number(0, math.pi)]
-_Length = Annotated[float, _number(0, 100)]
-_Share = Annotated[float, _number(0, 1)]
+_Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+_Angle = Annotated[float, _up_to(math.pi)]
+_Length = Annotated[float, _up_to(100)]
+_Share = Annotated[float, _up_to(1)]
 
 
 @dataclass(frozen=True)
@@ -90,17 +78,17 @@ class MatcherFindings:
     chance: Mapping[str, _Finite] = field(default_factory=dict)
     contradicted: Mapping[str, str] = field(default_factory=dict)
     stage1: Literal["pnp", "rig"] = "pnp"
-    range_rotation_deg: Annotated[float | None, _number(0, 180)] = None
-    range_translation_m: Annotated[float | None, _number(0, 100)] = None
-    systematic_rotation_rad: Annotated[float | None, _number(0, math.pi)] = None
-    systematic_translation_m: Annotated[float | None, _number(0, 100)] = None
+    range_rotation_deg: Annotated[float | None, _up_to(180)] = None
+    range_translation_m: Annotated[float | None, _up_to(100)] = None
+    systematic_rotation_rad: Annotated[float | None, _up_to(math.pi)] = None
+    systematic_translation_m: Annotated[float | None, _up_to(100)] = None
     camera_share: _Share = 0.5
     elevation_rad: _Angle = 0.0
     elevation_stretch: _Share = 0.0
     scan_motion_m: _Length = 0.0
     place_rotation_rad: _Angle = 0.0
     place_translation_m: _Length = 0.0
-    place_variance: Annotated[float, _number(0, 1e6)] = 0.0
+    place_variance: Annotated[float, _up_to(1e6)] = 0.0
 
     @staticmethod
     def from_metadata(metadata: Mapping[str, Any]) -> MatcherFindings:

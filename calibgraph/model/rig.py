@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self
@@ -272,8 +272,8 @@ class Camera(_Model):
     @cached_property
     def lens(self) -> Lens:
         """The lens model for projection."""
-        make: Callable[..., Lens] = getattr(Lens, self.model)
-        return make(**self.intrinsics_px.model_dump(), distortion=self.distortion)
+        k = self.intrinsics_px
+        return Lens.of(self.model, fx=k.fx, fy=k.fy, cx=k.cx, cy=k.cy, distortion=self.distortion)
 
     @property
     def matrix_px(self) -> Array:

@@ -1,6 +1,6 @@
 """The pairs of a session, kept in a file after every change, and what they determine.
 
-By PnP with the paper's three solvers, then by one solve of all cameras.
+By PnP (SQPnP), then by one solve of all cameras.
 """
 
 from __future__ import annotations
@@ -27,9 +27,6 @@ from calibgraph.solver.pnp import view_plane
 
 MIN_PAIRS = 6
 """Of a camera, on different structures (paper, "Reference by manual picking")."""
-SOLVERS = {
-    "iterative": cv2.SOLVEPNP_ITERATIVE, "EPnP": cv2.SOLVEPNP_EPNP, "SQPnP": cv2.SOLVEPNP_SQPNP,
-}  # fmt: skip
 SOLVE = Config(
     loss_scale_px=1e4, gate_px=1000.0, learnt_weights=False, grid_columns=400,
     grid_rows=400, common_deg=0.0, common_cm=0.0,
@@ -45,15 +42,11 @@ class CameraEstimate:
     """What the pairs of one camera give.
 
     Attributes:
-        solver: the one whose median error is least; empty if there is none.
-        solver_px: median error of each solver.
         residuals_px: (n, 2) projected minus picked, at the estimate, or at the guess without one.
         left_out_px: (n,) distance of each pair from the pose of all others; NaN if not known.
         problem: why there is no estimate, in words.
     """
 
-    solver: str
-    solver_px: dict[str, float]
     residuals_px: Array
     left_out_px: Array
     problem: str
@@ -79,18 +72,17 @@ def estimate_from_pairs(rig: Rig, pairs: Sequence[Pair]) -> Estimate:
     """
     of = {name: [pair for pair in pairs if pair.camera == name] for name in rig.cameras}
     of = {name: some for name, some in of.items() if some}
-    poses = {name: _poses(rig.cameras[name], some) for name, some in of.items()}
-    starts = {name: next(iter(found.values()))[0] for name, found in poses.items() if found}
+    problems = {name: _problem(some) for name, some in of.items()}
+    found = {name: _pnp(rig.cameras[name], of[name]) for name in of if not problems[name]}
+    starts = {name: T for name, T in found.items() if T is not None}
     solved = _solve(rig, starts, [pair for name in starts for pair in of[name]]) if starts else None
     cameras = {}
     for name, some in of.items():
         camera = (solved or rig).cameras[name] if name in starts else rig.cameras[name]
         cameras[name] = CameraEstimate(
-            solver=next(iter(poses[name]), ""),
-            solver_px={solver: error for solver, (_, error) in poses[name].items()},
             residuals_px=_residuals(camera, camera.T_camera_lidar, some),
             left_out_px=_left_out(camera, some) if name in starts else np.full(len(some), np.nan),
-            problem="" if poses[name] else _problem(some),
+            problem="" if name in starts else problems[name] or "PnP finds no pose",
         )
     return solved, cameras
 
@@ -127,19 +119,8 @@ def reference_rig(estimate: Estimate) -> Rig:
     return rig
 
 
-def _poses(camera: Camera, pairs: Sequence[Pair]) -> dict[str, tuple[Array, float]]:
-    """T_camera_lidar and median error [px] by each solver, the best first; none of few pairs."""
-    if len(pairs) < MIN_PAIRS or _problem(pairs):
-        return {}
-    found = {}
-    for name, method in SOLVERS.items():
-        T = _pnp(camera, pairs, method)
-        if T is not None:
-            found[name] = T, float(np.median(np.linalg.norm(_residuals(camera, T, pairs), axis=1)))
-    return dict(sorted(found.items(), key=lambda one: one[1][1]))
-
-
-def _pnp(camera: Camera, pairs: Sequence[Pair], method: int) -> Array | None:
+def _pnp(camera: Camera, pairs: Sequence[Pair]) -> Array | None:
+    """T_camera_lidar; None if there is none."""
     pixels, points = _arrays(pairs)
     turn, plane = view_plane(camera, pixels)
     usable = np.isfinite(plane[:, 0])
@@ -147,7 +128,7 @@ def _pnp(camera: Camera, pairs: Sequence[Pair], method: int) -> Array | None:
         return None
     try:
         found, turned, shift = cv2.solvePnP(
-            points[usable], plane[usable], np.eye(3), None, flags=method
+            points[usable], plane[usable], np.eye(3), None, flags=cv2.SOLVEPNP_SQPNP
         )
     except cv2.error:  # a degenerate layout
         return None
@@ -160,7 +141,7 @@ def _left_out(camera: Camera, pairs: Sequence[Pair]) -> Array:
     distances = np.full(len(pairs), np.nan)
     for i, pair in enumerate(pairs if len(pairs) > MIN_PAIRS else ()):
         others = [*pairs[:i], *pairs[i + 1 :]]
-        T = _pnp(camera, others, cv2.SOLVEPNP_SQPNP)
+        T = _pnp(camera, others)
         if T is not None:
             distances[i] = np.linalg.norm(_residuals(camera, T, [pair]))
     return distances

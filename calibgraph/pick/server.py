@@ -146,8 +146,6 @@ def _answer(one: CameraEstimate, solved: Camera | None) -> dict[str, Any]:
         np.asarray(solved.covariance))  # fmt: skip
     return {
         "problem": one.problem,
-        "solver": one.solver,
-        "solver_px": one.solver_px,
         "sigma_deg": None if bars is None else bars[0].tolist(),
         "sigma_cm": None if bars is None else bars[1].tolist(),
         "residuals_px": [row if np.isfinite(row).all() else None

@@ -40,9 +40,7 @@ def create_app(settings: Settings) -> FastAPI:
         lifespan=_lifespan,
     )
     app.state.service = service = Service(settings)
-    app.add_middleware(
-        RequestGuard, settings=settings, tokens=service.tokens, answers=service.answers
-    )
+    app.add_middleware(RequestGuard, settings=settings, tokens=service.tokens)
     files = StaticFiles(directory=STATIC_FOLDER, packages=[("calibgraph.report", "static")])
     app.mount("/static", files, name="static")
     app.include_router(router)

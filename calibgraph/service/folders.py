@@ -1,17 +1,12 @@
-"""Folders: the server's own, with one per job and tracker, and the roots that jobs may read from.
-
-A root, or what is in it, is a place: its fsspec protocol and its path without links, as one text.
-"""
+"""The server's data folder, with one per job and tracker."""
 
 import fcntl
 import os
 import shutil
 from pathlib import Path
-from urllib.parse import unquote
 
 from calibgraph.errors import FileError
 from calibgraph.files import require_place_for_folder, sync_folder
-from calibgraph.fleet.files import is_local, locate
 
 INPUT, SCRATCH, WORK, RESULT, LOG = "input", "scratch", "work", "result", "log.txt"
 """In a job's folder: its input, its working folder, its result as it is written, then; its log."""
@@ -69,45 +64,3 @@ def _lock(folder: Path) -> int:
     except OSError as error:
         raise FileError(folder, f"cannot be locked ({error.strerror})") from error
     return descriptor
-
-
-def open_roots(uris: tuple[str, ...]) -> tuple[str, ...]:
-    """The places of these URIs.
-
-    Raises:
-        FileError: if one is no URI that can be read, or a local folder that is not there.
-    """
-    if "" in uris:
-        raise FileError("--root", "is empty; name a folder, or leave it out")
-    return tuple(map(_place, uris))
-
-
-def require_inside(uri: str, roots: tuple[str, ...]) -> None:
-    """Check that a URI is inside the roots; links of local folders are followed first.
-
-    Raises:
-        FileError: if not. The message is the same whether or not anything is there.
-    """
-    outside = FileError(uri[:200], "is not inside the folders that this server reads from")
-    if "::" in uri or not uri.isprintable() or ".." in unquote(uri).split("/"):
-        raise outside
-    protocols = tuple(root.partition("//")[0] for root in roots)
-    if "://" in uri and not uri.startswith(protocols):
-        raise outside  # before a store's client is loaded
-    try:
-        place = _place(uri)
-    except (FileError, ValueError):
-        raise outside from None
-    if not any(f"{place}/".startswith(f"{root.rstrip('/')}/") for root in roots):
-        raise outside
-
-
-def _place(uri: str) -> str:
-    """The place of a URI."""
-    filesystem, path = locate(uri)
-    if not is_local(filesystem):
-        return f"{uri.partition('://')[0]}://{path.rstrip('/')}"
-    try:
-        return f"file://{Path(path).resolve(strict=True)}"
-    except (OSError, RuntimeError) as error:
-        raise FileError(uri, "no such file or folder; check the path") from error

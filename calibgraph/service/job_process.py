@@ -21,7 +21,6 @@ from calibgraph.child_process import (
 )
 from calibgraph.errors import CalibrationError, FileError
 from calibgraph.files import sha256, write_text
-from calibgraph.fleet.files import fetch
 from calibgraph.io.dataset import load_dataset
 from calibgraph.io.rigs import load_rig
 from calibgraph.matching.named import structure_matcher
@@ -39,7 +38,6 @@ from calibgraph.service.folders import (
     SCRATCH,
     SUMMARY,
     WORK,
-    require_inside,
 )  # fmt: skip
 from calibgraph.service.requests import (
     RIG,
@@ -53,7 +51,6 @@ from calibgraph.service.requests import (
 )
 
 _NOTE_EVERY_S = 0.1
-_KNOWN_SUFFIXES = (".bag", ".mcap", ".db3", ".parquet", ".csv", ".yaml", ".yml", ".txt")
 
 
 def run_job(task: JobTask, note: Note) -> Outcome:
@@ -80,8 +77,6 @@ def run_job(task: JobTask, note: Note) -> Outcome:
 def _input(task: JobTask, name: str) -> Path | None:
     """An input, made ready in the working folder; None if it was not given."""
     upload = task.folder / INPUT / name
-    if name in task.job.uris:
-        return _fetched(task, task.job.uris[name], name)
     if not upload.exists():
         return None
     if name in (RIG, TABLE):
@@ -95,22 +90,6 @@ def _room(task: JobTask) -> int:
     """How much of the disk an input may take: half of the free space is left to others."""
     free = shutil.disk_usage(task.folder).free - task.settings.free_bytes
     return max(0, min(task.settings.recording_bytes, free // 2))
-
-
-def _fetched(task: JobTask, uri: str, name: str) -> Path:
-    """A link to what is at a URI, or to the copy of what is remote."""
-    require_inside(uri, task.settings.roots)
-    copies = Path(f"{name}_copy")
-    copies.mkdir()
-    try:
-        found = fetch(uri, copies, _room(task))
-    except (CalibrationError, OSError, MemoryError):
-        raise
-    except Exception as error:  # of any store's client
-        raise OSError(0, f"{uri}: cannot be fetched ({type(error).__name__})") from error
-    link = Path(f"{name}{found.suffix if found.suffix in _KNOWN_SUFFIXES else ''}")
-    link.symlink_to(found.resolve())
-    return link
 
 
 def _recordings(task: JobTask) -> list[Path]:

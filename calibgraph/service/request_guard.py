@@ -9,7 +9,6 @@ import re
 import secrets
 import time
 from base64 import b64decode
-from collections import Counter
 from contextlib import suppress
 from pathlib import Path
 from typing import Literal, get_args
@@ -67,16 +66,14 @@ _SAFE = ("GET", "HEAD", "OPTIONS")
 
 
 class RequestGuard:
-    """Checks requests before any route, adds headers to all answers, counts them by status.
+    """Checks requests before any route, adds headers to all answers.
 
     A page of another site that a browser shows could otherwise call a server without tokens: its
     name is then not one of ours, or its ``Origin`` is another one.
     """
 
-    def __init__(
-        self, app: ASGIApp, settings: Settings, tokens: Tokens | None, answers: Counter[int]
-    ) -> None:
-        self._app, self._settings, self._tokens, self._answers = app, settings, tokens, answers
+    def __init__(self, app: ASGIApp, settings: Settings, tokens: Tokens | None) -> None:
+        self._app, self._settings, self._tokens = app, settings, tokens
         self._hosts = tuple(name.lower() for name in settings.hosts)
         if not settings.hosts and settings.tokens is None:
             self._hosts = LOCAL_NAMES
@@ -97,7 +94,6 @@ class RequestGuard:
             if message["type"] == "http.response.start":
                 rest = asyncio.create_task(body.drop())  # who still sends can read the answer
                 await asyncio.wait([rest], timeout=UNREAD_S)
-                self._answers[message["status"]] += 1
                 headers = MutableHeaders(scope=message)
                 own = {"Connection": "close"} if not rest.done() else {}
                 own |= {"Content-Security-Policy": DOCS_POLICY} if path == "/docs" else {}

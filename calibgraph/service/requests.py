@@ -91,10 +91,9 @@ SETTINGS_OF: Mapping[JobKind, type[BaseModel]] = {
 
 
 class Job(StrictNumbers):
-    """A job as it is kept: its URIs by the name of the input; uploads are in its folder."""
+    """A job as it is kept; its uploads are in its folder."""
 
     kind: JobKind
-    uris: dict[str, Annotated[str, StringConstraints(min_length=1, max_length=2000)]] = {}
     recordings: int = 0
     settings: dict[str, Any] = {}
     name: Annotated[str, StringConstraints(max_length=100), BeforeValidator(_printable)] = ""
@@ -130,12 +129,11 @@ class Settings(StrictNumbers):
         tokens: file of the tokens that may call; None: anyone on this machine may.
         hosts: names by which the server is called; others are refused. Empty: without a token file
             the names of this machine for itself, else any.
-        roots: URIs of the folders from which jobs may read; none by default.
         jobs_at_once: child processes for jobs.
         most_queued: jobs that wait; further ones are refused for the time being.
         job_timeout_s: longest time of a job.
         memory_bytes: that a job, or a process with trackers, may allocate.
-        recording_bytes: most bytes of an upload, packed and unpacked, and of a remote recording.
+        recording_bytes: most bytes of an upload, packed and unpacked.
         free_bytes: of the disk; with less, nothing is accepted.
         keep_s: how long the results of finished jobs are kept.
         tracker_processes: that hold the trackers; they start with the first.
@@ -146,7 +144,6 @@ class Settings(StrictNumbers):
     data: Path
     tokens: Path | None = None
     hosts: tuple[str, ...] = ()
-    roots: tuple[str, ...] = ()
     jobs_at_once: Count = Field(default_factory=count_cores)
     most_queued: Count = 1000
     job_timeout_s: Seconds = 3600.0

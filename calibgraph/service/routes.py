@@ -1,4 +1,4 @@
-"""Routes of jobs and of their results, of trackers, the page, health and a few counters."""
+"""Routes of jobs and of their results, of trackers, the page and health."""
 
 import asyncio
 import time
@@ -86,10 +86,10 @@ _FORM = {"type": "object", "properties": _PARTS | dict.fromkeys(TEXTS, {"type": 
     openapi_extra={"requestBody": {"content": {"multipart/form-data": {"schema": _FORM}}}},
 )
 async def submit(kind: JobKind, request: Request, response: Response, state: State) -> JobAnswer:
-    """Ask for a job: a form with files, or fields with their URIs, and settings as JSON."""
+    """Ask for a job: a form with files, and settings as JSON."""
     size = int(request.headers.get("content-length", "0"))
     await run_in_threadpool(state.require_room, size)
-    id, job = await receive_job(request, kind, state.folder, state.settings.roots)
+    id, job = await receive_job(request, kind, state.folder)
     record = await run_in_threadpool(state.add, id, job)
     response.headers["Location"] = f"/v1/jobs/{id}"
     return _answer(record, state)
@@ -185,17 +185,6 @@ def healthz(state: State) -> dict[str, str]:
     state.require_room(0)
     state.jobs.counts()
     return {"status": "ok"}
-
-
-@router.get("/metrics", response_class=PlainTextResponse)
-def metrics(state: State) -> str:
-    """Counters as Prometheus reads them: jobs by state, answers by status."""
-    jobs = [f'calibgraph_jobs{{state="{key}"}} {n}' for key, n in state.jobs.counts().items()]
-    answers = [
-        f'calibgraph_answers_total{{status="{status}"}} {n}'
-        for status, n in sorted(state.answers.items())
-    ]
-    return "\n".join([*jobs, *answers, ""])
 
 
 async def _tracker(

@@ -3,7 +3,6 @@
 import asyncio
 import shutil
 import zlib
-from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ from fastapi import Request
 
 from calibgraph.child_process import ChildEndedError, ChildProcess, ChildTimeoutError
 from calibgraph.errors import CalibrationError
-from calibgraph.service.folders import DataFolder, open_roots
+from calibgraph.service.folders import DataFolder
 from calibgraph.service.jobs import JobRecord, JobTable
 from calibgraph.service.problems import Problem
 from calibgraph.service.request_guard import load_tokens
@@ -24,13 +23,11 @@ class Service:
     """The parts of a server.
 
     Raises:
-        CalibrationError: if the token file, the data folder, the database or a root cannot be used.
+        CalibrationError: if the token file, the data folder or the database cannot be used.
     """
 
     def __init__(self, settings: Settings) -> None:
-        settings = settings.model_copy(update={"roots": open_roots(settings.roots)})
         self.settings, self.is_stopping = settings, False
-        self.answers: Counter[int] = Counter()  # by status
         self.tokens = None if settings.tokens is None else load_tokens(settings.tokens)
         self.folder = DataFolder(settings.data)
         try:

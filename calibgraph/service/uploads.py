@@ -12,7 +12,7 @@ from starlette.datastructures import FormData, UploadFile
 from starlette.formparsers import MultiPartException, MultiPartParser
 
 from calibgraph.files import describe
-from calibgraph.service.folders import INPUT, LOG, DataFolder, require_inside
+from calibgraph.service.folders import INPUT, LOG, DataFolder
 from calibgraph.service.problems import Problem
 from calibgraph.service.requests import (
     MAX_RECORDINGS,
@@ -37,9 +37,7 @@ class _Form(MultiPartParser):
         self.is_whole = True
 
 
-async def receive_job(
-    request: Request, kind: JobKind, folder: DataFolder, roots: tuple[str, ...]
-) -> tuple[str, Job]:
+async def receive_job(request: Request, kind: JobKind, folder: DataFolder) -> tuple[str, Job]:
     """Read the form of a job, which is on disk then; its id, which names its folder, and it."""
     if not request.headers.get("content-type", "").startswith("multipart/form-data"):
         raise Problem(415, "send a form: multipart/form-data")
@@ -59,22 +57,18 @@ async def receive_job(
     except (MultiPartException, LookupError) as error:
         raise Problem(400, f"the form cannot be read ({error})") from error
     try:
-        return await run_in_threadpool(_keep, form, kind, folder, roots)
+        return await run_in_threadpool(_keep, form, kind, folder)
     finally:
         await form.close()
 
 
-def _keep(
-    form: FormData, kind: JobKind, folder: DataFolder, roots: tuple[str, ...]
-) -> tuple[str, Job]:
+def _keep(form: FormData, kind: JobKind, folder: DataFolder) -> tuple[str, Job]:
     """Write the files of a form into the folder of a new job."""
     id = secrets.token_hex(16)
     arriving = folder.arriving / id
     (arriving / INPUT).mkdir(parents=True, mode=0o700)
     try:
         job = _job_of(form, kind, arriving / INPUT)
-        for uri in job.uris.values():
-            require_inside(uri, roots)
         (arriving / LOG).touch()
         folder.keep(arriving)
     finally:
@@ -83,8 +77,8 @@ def _keep(
 
 
 def _job_of(form: FormData, kind: JobKind, folder: Path) -> Job:
-    """The job of a form; files are written, texts are URIs, settings or words for people."""
-    uris, texts, counts = dict[str, str](), dict[str, str](), dict[str, int]()
+    """The job of a form; files are written, texts are settings or words for people."""
+    texts, counts = dict[str, str](), dict[str, int]()
     for name, value in form.multi_items():
         if name in TEXTS and isinstance(value, str):
             texts[name] = value
@@ -96,17 +90,16 @@ def _job_of(form: FormData, kind: JobKind, folder: Path) -> Job:
         if count > (MAX_RECORDINGS if name == RECORDING else 1):
             raise Problem(422, f"{name!r} is given {count} times")
         target = recording_name(count - 1) if name == RECORDING else name
-        if isinstance(value, UploadFile):
-            with (folder / target).open("xb") as file:
-                shutil.copyfileobj(value.file, file, 2**20)
-        else:
-            uris[target] = value
+        if not isinstance(value, UploadFile):
+            raise Problem(422, f"{name!r} is a text; send it as a file")
+        with (folder / target).open("xb") as file:
+            shutil.copyfileobj(value.file, file, 2**20)
     for name, is_required in PARTS[kind].items():
         if is_required and name not in counts:
-            raise Problem(422, f"{name!r} is missing; add it as a file, or a field with its URI")
+            raise Problem(422, f"{name!r} is missing; add it as a file")
     try:
         settings = SETTINGS_OF[kind].model_validate_json(texts.pop("settings", "") or "{}")
         recordings, kept = counts.get(RECORDING, 0), settings.model_dump(mode="json")
-        return Job(kind=kind, uris=uris, recordings=recordings, settings=kept, **texts)
+        return Job(kind=kind, recordings=recordings, settings=kept, **texts)
     except ValidationError as error:
         raise Problem(422, describe(error)) from error

@@ -31,13 +31,13 @@ from scipy.spatial.transform import Rotation
 from calibgraph.arrays import Array
 from calibgraph.graph.by_place import place_of
 from calibgraph.graph.lens import LensVariable
-from calibgraph.model.clock import at_pixels, motion_of
+from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import adjoints, to_T_camera_lidar, transform
 from calibgraph.model.rig import Camera
 from calibgraph.solver.covariance import convex_hessian, with_pseudo_frames
-from calibgraph.solver.matches import CameraBlock
-from calibgraph.solver.robust import ResidualScale, quantile, upper_root
+from calibgraph.solver.matches import CameraBlock, camera_block
+from calibgraph.solver.robust import ResidualScale, quantile
 from calibgraph.solver.within_place import WEAK
 from factors import Columns, ProjectionBlock, to_runs
 from factors.columns import DISTORTION
@@ -114,7 +114,7 @@ class ColumnFit:
         values = (inverse @ (self.hessian @ self.values)[rows, None])[:, :, 0]
         frames, pulls = len(self.gradients), self.gradients.T[rows]
         shown = pulls @ pulls.transpose(0, 2, 1)
-        scatter = with_pseudo_frames(shown, own, np.full(size, float(frames)))
+        scatter = with_pseudo_frames(shown, own, float(frames))
         scatter += _nearly_free(size) if frames > 1 else np.nan
         follow = inverse @ self.hessian[rows, len(self.hessian) - self.considered :]
         whole = inverse @ scatter @ inverse + self.shared * inverse
@@ -204,11 +204,8 @@ def block_of(camera: Camera, table: Correspondences) -> CameraBlock:
 
     If the motion of the LiDAR is known, points are where they are when they are seen.
     """
-    table = at_pixels(camera, table.select(np.argsort(table.frame, kind="stable")))
-    root = None if table.information_px is None else upper_root(table.information_px)
-    points, motion = table.points_lidar_m, motion_of(camera, table)
-    block = ProjectionBlock(camera.lens, points, table.pixels_px, root, motion=motion)
-    return CameraBlock(block, table.information_px, table.frame)
+    in_order = table.select(np.argsort(table.frame, kind="stable"))
+    return camera_block(camera, in_order, Config())
 
 
 def apply_twist(camera: Camera, twist: Array) -> Camera:

@@ -46,10 +46,16 @@ def estimate_variance_ratios(linear: Linearization, present: VarianceRatios) -> 
         linear: with the present ratios.
         present: the ratios of its model.
     """
-    evidence = squared_displacements(linear)
+    evidence, places = squared_displacements(linear), linear.model.places
+    without = {name: one._replace(free=0.0) for name, one in evidence.items()}
+    for known in (without, evidence):  # the range, whatever the data leave open
+        if not ratios_by_evidence(known, places=places, present=present).is_near(present):
+            break
+    else:
+        return present
     for name, t in undetermined(linear).items():
         evidence[name] = evidence[name]._replace(free=evidence[name].free - t)
-    return ratios_by_evidence(evidence, places=linear.model.places, present=present)
+    return ratios_by_evidence(evidence, places=places, present=present)
 
 
 def ratios_by_evidence(

@@ -14,7 +14,7 @@ from calibgraph.graph.objective import pose_key
 from calibgraph.model.findings import error_components
 from calibgraph.model.geometry import pose_rows, to_T_lidar_camera
 from calibgraph.solver.two_pass import Objective, Scales, Transforms, to_values
-from factors import BlockSums, ProjectionBlock
+from factors import BlockSums, ProjectionBlock, to_runs
 
 
 def convex_hessian(hessian: Array, otherwise: Array) -> Array:
@@ -82,9 +82,10 @@ class FittedObjective:
         """Per camera with correspondences, the sums of its frames; empty without terms."""
         if not self.objective.uses_correspondences:
             return {}
-        edges = {name: block.frame_edges for name, block in self.objective.blocks.items()}
+        T, blocks = self.T_camera_lidar, self.objective.blocks
+        edges = {name: block.frame_edges for name, block in blocks.items()}
         return {
-            name: block.frame_sums(self.pose(name), edges[name], curvature=True)
+            name: block.summarize(T[name][None], to_runs(edges[name]), curvature=True)
             for name, block in self.projections.items()
         }
 
@@ -115,7 +116,7 @@ frames)."""
 
 
 def with_pseudo_frames(
-    scatter: Array, hessian: Array, frames: Array, usual: Array | None = None
+    scatter: Array, hessian: Array, frames: float, usual: Array | None = None
 ) -> Array:
     """The scatter of the frames' gradients, with an allowance for few frames.
 
@@ -129,18 +130,16 @@ def with_pseudo_frames(
     Args:
         scatter: (..., n, n) sum over frames of the outer products of their gradients.
         hessian: (..., n, n).
-        frames: (n,) number of frames behind each row.
+        frames: their number.
         usual: (n, n) the scatter that is usual for as many frames; None if nothing is known.
     """
     vectors = np.linalg.eigh(hessian)[1]
-    root = np.maximum(frames, 1.0) ** -0.5
-    of_frame = np.outer(root, root)
-    along = _along(vectors, scatter * of_frame)
-    count = np.maximum(frames @ vectors**2, 1.0)
+    count = max(frames, 1.0)
+    along = _along(vectors, scatter) / count
     if usual is None:
-        mean = along * count / np.maximum(count - 1.0, 1.0)
+        mean = along * count / max(count - 1.0, 1.0)
     else:
-        prior = _along(vectors, usual * of_frame) / PSEUDO_FRAMES
+        prior = _along(vectors, usual) / (count * PSEUDO_FRAMES)
         prior_frames = error_components().prior_frames
         mean = (prior_frames * prior + count * along) / (prior_frames + count - 1.0)
     spread = vectors * (PSEUDO_FRAMES * mean)[..., None, :]

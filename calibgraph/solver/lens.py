@@ -42,7 +42,7 @@ _WEAK_PRIOR = 0.01  # information: a lens that is ten sigmas off is hardly held 
 _MOST_STEPS, _MINIMAL = 20, 1e-4  # of Gauss-Newton; decrease of the cost by the last
 _SCENES = 0.7, 1.4  # times as far are the things of another recording: so streets scatter
 _DEPTHS = 0.5, 1.0, 2.0  # of a scene, over its mean
-_DIRECTIONS_SEEN = 500  # at most, of those of the matches
+_SAMPLE, _DIRECTIONS_SEEN = 3000, 200  # at most, of the matches, and of their directions
 _NEAREST_M = 0.1  # added to distances, whose logarithms are taken
 _DIRECTIONS = "pitch", "yaw", "roll", "x", "y", "z"
 _UNITS = {FOCAL: "px", CENTRE_X: "px", CENTRE_Y: "px", OFFSET: "s", READOUT: "s"}
@@ -117,6 +117,7 @@ def lens_errors(at: FittedObjective) -> dict[int, Array]:
     found = {}
     for name, block in at.projections.items():
         lens, T = considered_lens(at.objective.rig.cameras[name], block), at.T_camera_lidar[name]
+        block = block.select(np.arange(0, len(block), -(-len(block) // _SAMPLE)))  # noqa: PLW2901
         estimated = at.objective.lenses[name].free.parameters if name in at.objective.lenses else ()
         columns = lens_columns(lens, block, T)
         own = error_by_lens(lens, columns, block, T, of=at.objective.config.of, estimated=estimated)

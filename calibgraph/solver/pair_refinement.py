@@ -17,6 +17,7 @@ from calibgraph.model.geometry import (
     relative_covariance,
     relative_transform,
     retract_all,
+    to_T_lidar_camera,
     twist_between,
 )
 from calibgraph.solver.covariance import FittedObjective
@@ -122,9 +123,10 @@ def fit_pair(
         if not stands:
             before, sigmas = sigmas, np.array([term.sigma_px(now) for term in terms])
             stands = number > _MOST or bool((np.abs(sigmas - before) <= _SETTLED * sigmas).all())
-            scaled = [t.with_sigma(s) for t, s in zip(terms, sigmas.tolist(), strict=True)]
-        for own, term in zip(rows, scaled, strict=True):
-            sums = term.sums(now)
+            blocks = [t.scaled(s) for t, s in zip(terms, sigmas.tolist(), strict=True)]
+        poses = dict(zip(names, map(to_T_lidar_camera, T), strict=True))
+        for own, term, block in zip(rows, terms, blocks, strict=True):
+            sums = block.sums(poses[term.a], poses[term.b])
             data[own[:, None], own] += sums.hessian
             gradient[own] += sums.gradient
         gradient[:6] += held @ local_coordinates(start[names[0]], invert(T[:1]))[0]

@@ -23,7 +23,6 @@ from calibgraph.solver.robust import (
     robust_spread,
 )
 from factors import (
-    BlockSums,
     PairBlock,
     pair_block_factor,
     unproject,
@@ -66,8 +65,11 @@ class PairTerm:
 
     def with_sigma(self, sigma_px: float) -> PairTerm:
         """With residuals divided by sigma, and the loss's scale in units of it."""
-        block = self.block.rescale(scale=CAUCHY_SCALE_SIGMAS, sigma=sigma_px)
-        return replace(self, block=block)
+        return replace(self, block=self.scaled(sigma_px))
+
+    def scaled(self, sigma_px: float) -> PairBlock:
+        """The features with this sigma."""
+        return self.block.rescale(scale=CAUCHY_SCALE_SIGMAS, sigma=sigma_px)
 
     def errors_px(self, T_camera_lidar: Mapping[str, Array]) -> Array:
         """(n,) lengths of the residuals; infinite where B cannot see the point."""
@@ -82,10 +84,6 @@ class PairTerm:
     def without_outliers(self, T_camera_lidar: Mapping[str, Array], sigma_px: float) -> PairTerm:
         """The features within the gate."""
         return self.select(self.errors_px(T_camera_lidar) <= GATE_SIGMAS * sigma_px)
-
-    def sums(self, T_camera_lidar: Mapping[str, Array]) -> BlockSums:
-        """H (12, 12), b (12,) and c, in the tangents of ``T_lidar_a`` and ``T_lidar_b``."""
-        return self.block.sums(*self._poses(T_camera_lidar))
 
     def _poses(self, T_camera_lidar: Mapping[str, Array]) -> tuple[gtsam.Pose3, gtsam.Pose3]:
         return (

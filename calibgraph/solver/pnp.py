@@ -1,7 +1,6 @@
 """Robust poses of frames of one camera: many at once over stacked sums, and of one by MAGSAC."""
 
 import math
-from dataclasses import dataclass
 from itertools import product
 
 import cv2
@@ -34,27 +33,9 @@ _MIN_INLIER_SHARE = 0.1  # chosen, not measured
 _MIN_SCALED_EIGENVALUE = 1e-9  # below it a direction is free: points on one line, or in one place
 
 
-@dataclass(frozen=True, eq=False)
-class FramePoses:
-    """Frames at the least robust cost of each.
-
-    Attributes:
-        T_camera_lidar: (f, 4, 4).
-        hessians: (f, 6, 6) there.
-        found: (f,) whether the fit stopped by its tolerance; of :func:`refine_frames`, whether
-            enough matches agree on it, and leave no direction of it free.
-        inliers: (f,) matches that it is fitted to; of :func:`refine_frames`, within the threshold.
-    """
-
-    T_camera_lidar: Array
-    hessians: Array
-    found: NDArray[np.bool_]
-    inliers: NDArray[np.int64]
-
-
 def fit_frames(
     block: ProjectionBlock, runs: Runs, T_camera_lidar: Array, *, tolerance: float = FINE
-) -> FramePoses:
+) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Minimize the robust cost of each frame by itself.
 
     Args:
@@ -62,6 +43,9 @@ def fit_frames(
         runs: (f, 2) those of each frame.
         T_camera_lidar: (f, 4, 4) starts.
         tolerance: relative decrease of the cost at which a frame is done.
+
+    Returns:
+        (f, 4, 4) minima; (f, 6, 6) Hessians there; (f,) which stopped by the tolerance.
     """
     T, sums = T_camera_lidar.copy(), block.packed_run_sums(T_camera_lidar, runs)
     dampings, active = np.full(len(T), _DAMPING), np.arange(len(T))
@@ -73,7 +57,7 @@ def fit_frames(
         new = block.packed_run_sums(tried[:count], runs[active[:count]])
     converged = dampings < MAX_DAMPING
     converged[active[:count]] = False
-    return FramePoses(T, unpack_sums(sums).hessian, converged, runs[:, 1] - runs[:, 0])
+    return T, unpack_sums(sums).hessian, converged
 
 
 def move_damped(
@@ -99,7 +83,7 @@ def move_damped(
 
 def refine_frames(
     block: ProjectionBlock, runs: Runs, T_camera_lidar: Array, config: Config
-) -> FramePoses:
+) -> tuple[Array, NDArray[np.bool_], NDArray[np.int64]]:
     """Re-select each frame's inliers with the full lens model and refine on them, a few times.
 
     Args:
@@ -107,6 +91,10 @@ def refine_frames(
         runs: (f, 2) those of each frame, one behind the other.
         T_camera_lidar: (f, 4, 4) starts.
         config: ``pnp_threshold_px``.
+
+    Returns:
+        (f, 4, 4) poses; (f,) whether enough matches agree on each, and leave no direction of it
+        free; (f,) matches within the threshold.
     """
     least = np.maximum(MIN_MATCHES, _MIN_INLIER_SHARE * (runs[:, 1] - runs[:, 0]))
     found = np.ones(len(runs), dtype=np.bool_)
@@ -119,10 +107,9 @@ def refine_frames(
         found &= inliers >= least
         some = block.select(inlier).rescale(scale=config.pnp_threshold_px / 2)
         places[~found] = 0
-        fit = fit_frames(some, places, T_camera_lidar, tolerance=tolerance)
-        T_camera_lidar = fit.T_camera_lidar
-        found &= smallest_scaled_eigenvalues(fit.hessians) >= _MIN_SCALED_EIGENVALUE
-    return FramePoses(T_camera_lidar, fit.hessians, found, inliers)
+        T_camera_lidar, own, _ = fit_frames(some, places, T_camera_lidar, tolerance=tolerance)
+        found &= smallest_scaled_eigenvalues(own) >= _MIN_SCALED_EIGENVALUE
+    return T_camera_lidar, found, inliers
 
 
 _MAX_SAMPLE = 4000  # matches; chosen, not measured
@@ -174,8 +161,8 @@ def frame_pose(
     start = ransac_pnp(camera, block, config, iterations=iterations)
     if start is None:
         return None
-    refined = refine_frames(block, np.array([[0, len(block)]]), start[None], config)
-    return refined.T_camera_lidar[0] if refined.found[0] else None
+    T, found, _ = refine_frames(block, np.array([[0, len(block)]]), start[None], config)
+    return T[0] if found[0] else None
 
 
 def ransac_pnp(
@@ -239,8 +226,8 @@ def pose_near_guess(
     block = ProjectionBlock(camera.lens, matches.points_lidar_m, matches.pixels_px)
     wide = block.rescale(scale=_WIDE * config.pnp_threshold_px)
     start, runs = camera.T_camera_lidar[None], np.array([[0, len(block)]])
-    T_camera_lidar: Array = fit_frames(wide, runs, start, tolerance=COARSE).T_camera_lidar[0]
-    return T_camera_lidar
+    T_camera_lidar, *_ = fit_frames(wide, runs, start, tolerance=COARSE)
+    return np.asarray(T_camera_lidar[0])
 
 
 def view_plane(camera: Camera, pixels_px: Array) -> tuple[Array, Array]:

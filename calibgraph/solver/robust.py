@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise
 
@@ -105,22 +104,6 @@ def quantile(values: Array, share: float) -> float:
     return float(quantiles(values, np.array([[0, len(values)]]), share)[0])
 
 
-def iterate_spread(quantile_below: Callable[[float, float], float]) -> float:
-    """The iteration of :func:`robust_spread`, of values that are known by their quantiles alone.
-
-    Args:
-        quantile_below: quantile, of a given share, of the values up to a limit; NaN without any.
-    """
-    spread = _START_FACTOR * quantile_below(math.inf, _START_QUANTILE)
-    for _ in range(_ROUNDS):
-        before, spread = spread, quantile_below(CUT * spread, 0.5)
-        if math.isnan(spread):
-            return before
-        if abs(spread - before) <= 1e-6 * before:
-            break
-    return spread
-
-
 def _spreads(
     values: Array, runs: NDArray[np.int64], start: tuple[float, float], rounds: int
 ) -> Array:
@@ -136,7 +119,7 @@ def _spreads(
 
 @compiled()
 def _fill_spreads(ordered, edges, start, rounds, found):  # type: ignore[no-untyped-def]
-    """Per run the start's quantile times its factor, then :func:`iterate_spread`."""
+    """Per run the start's quantile times its factor, then the iteration."""
     for i in range(len(found)):
         values = ordered[edges[i] : edges[i + 1]]
         spread = start[1] * _quantile_below(values, math.inf, start[0])

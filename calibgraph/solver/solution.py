@@ -39,7 +39,7 @@ from calibgraph.solver.pair_refinement import (
 )
 from calibgraph.solver.pairs import PairTerm, pair_terms
 from calibgraph.solver.places import ErrorFit
-from calibgraph.solver.sources import predict_variances, sources_by_camera, variances_by_source
+from calibgraph.solver.sources import error_sources
 from calibgraph.solver.two_pass import Objective, Optimum, Scales, Transforms
 
 
@@ -156,12 +156,7 @@ class Solution:
         Args:
             joint: (6 N, 6 N) the reported covariance, which may be wider than that of the matches.
         """
-        if self.error_fit is None:
-            return {}
-        total, cameras = np.diag(self.error_fit.covariance), self.fitted.cameras
-        parts, forecast = variances_by_source(self.error_fit), predict_variances(self.error_fit)
-        numbers = {n: k for k, n in enumerate(cameras) if n not in self.held}
-        return sources_by_camera(joint, total, parts, forecast, numbers=numbers)
+        return {} if self.error_fit is None else error_sources(self.error_fit, joint, self.held)
 
     @cached_property
     def pair_terms(self) -> tuple[PairTerm, ...]:

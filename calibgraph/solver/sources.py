@@ -6,7 +6,7 @@ different factors are independent, and their variances C J^T M S M J C add up to
 the rest.
 """
 
-from collections.abc import Mapping
+from collections.abc import Container
 
 import gtsam
 import numpy as np
@@ -37,48 +37,31 @@ _DISTORTIONS = ELEVATION, STRETCH, MOTION
 _NOTHING = 1e-8  # share of a variance: rounding of a difference
 
 
-def sources_by_camera(
-    joint: Array,
-    total: Array,
-    parts: Variances,
-    forecast: Mapping[int, Array],
-    *,
-    numbers: Mapping[str, int],
+def error_sources(
+    errors: ErrorFit, joint: Array, without: Container[str] = ()
 ) -> dict[str, ErrorSources]:
-    """Per camera, the sources of its error bar.
+    """Per camera, the sources of its error bar, the matches as those of the rest.
 
     Args:
+        errors: the error model at the estimate.
         joint: (6 N, 6 N) the reported covariance, which may be wider than that of the matches.
-        total: (6 N,) variances by the matches.
-        parts: of these, as of :func:`sources_of_error`.
-        forecast: likewise.
-        numbers: of the cameras.
+        without: cameras that have no error bar.
     """
-    flat = np.diag(joint) - total
-    forecast = {times: variance + flat / times for times, variance in forecast.items()}
-    total, parts = total + flat, {**parts, FLAT: flat}
-    return {n: sources_of_error(total, parts, forecast, number) for n, number in numbers.items()}
-
-
-def sources_of_error(
-    total: Array, parts: Variances, forecast: Mapping[int, Array], camera: int
-) -> ErrorSources:
-    """The sources of one camera's error bar.
-
-    Args:
-        total: (6 N,) variances of all cameras.
-        parts: per source, (6 N,) of its part; the matches have the rest.
-        forecast: by how many times more frames and places there are, (6 N,) variances.
-        camera: its number.
-    """
-    matches = np.maximum(total - sum(parts.values(), np.zeros(len(total))), 0.0)
-    variances, rows = {MATCHES: matches, **parts}, pose_rows(camera)
-    rotation, translation = (
-        _shares(variances, first + int(np.argmax(total[first : first + 3])))
-        for first in (rows.start, rows.start + 3)
-    )
-    later = {times: _error_bar(variance[rows]) for times, variance in forecast.items()}
-    return ErrorSources(*_error_bar(total[rows]), rotation, translation, later)
+    total, found = np.diag(joint), {}
+    flat = total - np.diag(errors.covariance)
+    parts = {**variances_by_source(errors), FLAT: flat}
+    rest = np.maximum(total - np.sum([*parts.values()], axis=0), 0.0)
+    variances, forecast = {MATCHES: rest, **parts}, predict_variances(errors)
+    for number, name in enumerate(errors.model.cameras):
+        if name not in without:
+            rows = pose_rows(number)
+            rotation, translation = (
+                _shares(variances, first + int(np.argmax(total[first : first + 3])))
+                for first in (rows.start, rows.start + 3)
+            )
+            later = {k: _error_bar((own + flat / k)[rows]) for k, own in forecast.items()}
+            found[name] = ErrorSources(*_error_bar(total[rows]), rotation, translation, later)
+    return found
 
 
 def _shares(variances: Variances, axis: int) -> dict[str, float]:

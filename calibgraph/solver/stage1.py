@@ -35,7 +35,7 @@ COMMON_SAMPLE = 1000
 """Matches of all frames, for a pose that single frames start from."""
 
 _MEDOID_OF = 500  # rotations at most: it is a start of the median, and its cost is quadratic
-_STEPS, _LEAST_RAD = 50, 1e-6  # of the median: far below any rotation that matters
+_STEPS, _LEAST_RAD = 50, 1e-5  # of the median: far below any rotation that matters
 _ALIKE_RAD, _ALIKE_M = np.radians(0.05), 0.01  # frames that differ by less all count
 
 
@@ -120,10 +120,9 @@ def _from_common_pose(
     for start_of in (pose_near_guess, ransac_pnp):
         if found.all() or (start := start_of(camera, sample, config)) is None:
             break
-        near = fit_frames(wide, runs, np.tile(start, (len(runs), 1, 1)), tolerance=COARSE)
-        refined = refine_frames(block, runs, near.T_camera_lidar, config)
-        majority = refined.inliers - 3 > (runs[:, 1] - runs[:, 0]) / 2
-        poses, found = refined.T_camera_lidar, refined.found & majority
+        near, *_ = fit_frames(wide, runs, np.tile(start, (len(runs), 1, 1)), tolerance=COARSE)
+        poses, found, inliers = refine_frames(block, runs, near, config)
+        found &= inliers - 3 > (runs[:, 1] - runs[:, 0]) / 2
     return poses, found
 
 

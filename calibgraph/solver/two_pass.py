@@ -25,7 +25,7 @@ from calibgraph.model.geometry import (
     to_T_lidar_camera,
 )
 from calibgraph.model.rig import Rig
-from calibgraph.solver.matches import MIN_MATCHES, BlockResiduals, CameraBlock
+from calibgraph.solver.matches import MIN_MATCHES, CameraBlock
 from calibgraph.solver.pairs import PairTerm, pair_graph, rows_of_pair
 from calibgraph.solver.preprocess import FILTERS
 from calibgraph.solver.robust import ResidualScale
@@ -164,10 +164,9 @@ class Objective:
 
     @cached_property
     def gate_hessian(self) -> dict[str, Array]:
-        """(6, 6) per camera after the gate, see ``BlockResiduals.gate_hessians``."""
+        """(6, 6) per camera after the gate, see ``CameraBlock.gate_hessian``."""
         return {
-            name: BlockResiduals.at(T, block).gate_hessians(scale)[0]
-            for name, (block, T, scale) in self.gated.items()
+            name: block.gate_hessian(T, scale) for name, (block, T, scale) in self.gated.items()
         }
 
     def with_pairs(self, pairs: Sequence[PairTerm]) -> Objective:

@@ -134,7 +134,7 @@ def allow_for_few_frames(
     usual = 1.0 + error_components().frame_correlation * (matches / frames - 1.0)
     count = free + 1.0  # as many frames of one place
     usual_scatter = usual * true * count / frames
-    whole = with_pseudo_frames(scatter, true, np.full(6, count), usual_scatter)
+    whole = with_pseudo_frames(scatter, true, count, usual_scatter)
     return whole * frames / count
 
 

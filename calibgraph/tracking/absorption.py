@@ -39,11 +39,9 @@ def begin_frames(state: State, frames: Sequence[StreamFrame]) -> None:
     state.updates += len(frames)
     for table in tables:
         state.knows_motion = table.twist_per_s is not None
-        if (
-            table.findings != state.findings
-            and (new := findings_of(table.findings)) != state.findings
-        ):
-            state.findings = new
+        if table.findings != state.findings:
+            new = findings_of(table.findings)
+            state.findings = state.findings if new == state.findings else new
     numbers = np.array([one.frame for one in frames], dtype=np.int64)
     state.numbers = np.concatenate([state.numbers, numbers])
     state.at = (*state.at, *(str(one.place) for one in frames))

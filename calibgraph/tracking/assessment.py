@@ -16,7 +16,6 @@ from calibgraph.model.pose_kernel import logarithms
 from calibgraph.model.summary import summarize
 from calibgraph.model.verdict import START, Check, Verdict
 from calibgraph.report.as_json import finite
-from calibgraph.solver.matches import BlockResiduals
 from calibgraph.tracking.estimate import Estimate
 from calibgraph.tracking.events import Event
 from calibgraph.tracking.frames import StreamFrame
@@ -136,7 +135,7 @@ def to_calibration(state: State, estimate: Estimate) -> Calibration:
         pair_covariance=pair_covariances(mounts, rig.T_camera_lidar),
         camera_verdicts=dict(Verdicts(state, estimate)),
         residuals={
-            name: BlockResiduals.at(state.references[camera], own[0]).summary(state.scales[camera])
+            name: own[0].summary(state.references[camera], state.scales[camera])
             for camera, name in cameras
             if (own := state.matches_of(camera)) is not None
         },

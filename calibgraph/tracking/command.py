@@ -126,9 +126,14 @@ class Run:
         try:
             self._report(self.calibrator.repeated)
             while some := stop.next_of(items, together):
-                new = [one for one in some if not self._is_known(one, known)]
-                frames = [one for one in new if not isinstance(one, CalibrationError)]
-                errors = [one for one in new if isinstance(one, CalibrationError)]
+                errors = [one for one in some if isinstance(one, CalibrationError)]
+                given = [one for one in some if not isinstance(one, CalibrationError)]
+                frames = [one for one in given if known is None or one.frame > known]
+                if len(frames) < len(given) and not self.skipped:
+                    self.notify(
+                        f"frame {given[0].frame} and others up to {known} are known: skipped"
+                    )
+                self.skipped += len(given) - len(frames)
                 for found in [*errors, *self.calibrator.update_all(frames)]:
                     if isinstance(found, CalibrationError):
                         self.left_out += 1
@@ -147,15 +152,6 @@ class Run:
         if self.skipped and not self.updates:
             found = f"no frame comes after {self.calibrator.tracker.frame}"
             self.notify(f"warning: {found}; if that number is wrong, choose another --out")
-
-    def _is_known(self, item: Item, known: int | None) -> bool:
-        """Whether an earlier run has a frame that comes before the first new one."""
-        if self.updates or known is None or isinstance(item, CalibrationError):
-            return False
-        if item.frame <= known and not self.skipped:
-            self.notify(f"frame {item.frame} and others up to {known} are known: skipped")
-        self.skipped += item.frame <= known
-        return item.frame <= known
 
     def _report(self, updates: Sequence[Update]) -> None:
         for update, line in zip(updates, json_lines(updates), strict=True):

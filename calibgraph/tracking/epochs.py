@@ -5,19 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.model.geometry import (
-    invert_each,
-    local_coordinates,
-    retract_all,
-    to_T_lidar_camera,
-)
+from calibgraph.model.geometry import invert_each, local_coordinates, retract_all, to_T_lidar_camera
 from calibgraph.model.pose_kernel import logarithms
 from calibgraph.solver.robust import median_norm, robust_spread, scale_from
 from calibgraph.solver.within_place import WEAK
-from calibgraph.tracking.absorption import (
-    add_to_totals,
-    count_epoch,
-)
+from calibgraph.tracking.absorption import add_to_totals, count_epoch
 from calibgraph.tracking.estimate import EpochGraph, locate_places
 from calibgraph.tracking.events import Event
 from calibgraph.tracking.gate import Gated, frame_sums
@@ -163,7 +155,7 @@ def _summarize_oldest(state: State) -> None:
     update_evidence(state, epoch, by_places)
     for camera in range(len(state.names)):
         select_walk(state, camera)
-    ungated = Sums.stack([_ungated(state, camera) for camera in range(len(state.names))])
+    ungated = Sums.stack([_drop_oldest(state, camera) for camera in range(len(state.names))])
     walks = state.walks + Sums(np.repeat(epoch.packed[:, None], len(STRENGTHS), axis=1))
     variance = state.walk_variance(STRENGTHS, size)
     over = np.repeat(state.overconfidence[:, None], len(STRENGTHS), axis=1)
@@ -179,26 +171,17 @@ def _summarize_oldest(state: State) -> None:
             state.places = state.places.with_camera_at(names[-1], camera, own)
     state.numbers, state.at = state.numbers[size:], state.at[size:]
     state.sums, state.sizes, state.poses = state.sums[size:], state.sizes[1:], state.poses[1:]
-    for camera in range(len(state.names)):
-        _drop_before(state, camera, int(state.numbers[0]))
 
 
-def _drop_before(state: State, camera: int, number: int) -> None:
-    """Drop the matches of frames before a number."""
-    own = state.matches_of(camera)
-    if own is None:
-        return
-    rows = own[0].frame >= number
-    raw, inliers = own[0].select(rows), own[1][rows]
-    state.put(camera, blocks=(raw,) if len(raw) else (), inliers=(inliers,) if len(raw) else ())
-
-
-def _ungated(state: State, camera: int) -> Sums:
-    """All matches of a camera in the oldest epoch, whatever the gate."""
+def _drop_oldest(state: State, camera: int) -> Sums:
+    """Drop a camera's matches of the oldest epoch; the sums of all of them, whatever the gate."""
     own, found = state.matches_of(camera), Sums.zeros()
     if own is None:
         return found
-    raw = own[0].select(own[0].frame <= state.numbers[state.sizes[0] - 1])
+    is_old = own[0].frame <= state.numbers[state.sizes[0] - 1]
+    raw, kept = own[0].select(is_old), own[0].select(~is_old)
+    inliers = own[1][~is_old]
+    state.put(camera, blocks=(kept,) if len(kept) else (), inliers=(inliers,) if len(kept) else ())
     if not len(raw):
         return found
     pose = to_T_lidar_camera(state.poses[0, camera])

@@ -134,7 +134,7 @@ class Terms:
             names,
             known,
             seen,
-            np.asarray(np.linalg.cholesky(weighted), dtype=np.float64),
+            np.asarray(np.linalg.cholesky(weighted)),
             spread.least,
             state.ratios.cameras * excess,
             _minimum(state, own, known, weighted),

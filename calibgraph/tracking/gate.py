@@ -12,7 +12,7 @@ from calibgraph.graph.objective import projection_graph
 from calibgraph.model.config import Config
 from calibgraph.model.geometry import invert_each
 from calibgraph.model.pose_kernel import logarithms
-from calibgraph.solver.matches import MIN_MATCHES, BlockResiduals, CameraBlock
+from calibgraph.solver.matches import MIN_MATCHES, CameraBlock
 from calibgraph.solver.pnp import frame_pose
 from calibgraph.solver.robust import ResidualScale
 from calibgraph.solver.two_pass import optimize
@@ -83,8 +83,7 @@ class Gated:
         block = self.raw.with_scale(scale).select(self.inliers)
         here = block.summarize(self.T_camera_lidar[None], runs, curvature=True)
         assert here.curvature is not None
-        residuals = BlockResiduals.at(self.T_camera_lidar, self.raw)
-        true = here.curvature[0] + residuals.gate_hessians(scale)[0]
+        true = here.curvature[0] + self.raw.gate_hessian(self.T_camera_lidar, scale)
         inverse = np.linalg.inv(np.linalg.cholesky(here.hessian[0] + WEAK))
         values, vectors = np.linalg.eigh(inverse @ true @ inverse.T)
         return np.asarray((vectors * np.clip(values, *_CURVATURES)) @ vectors.T)

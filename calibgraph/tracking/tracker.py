@@ -32,11 +32,7 @@ from calibgraph.tracking.absorption import (
     select_agreeing,
     start_cameras,
 )
-from calibgraph.tracking.assessment import (
-    Update,
-    make_updates,
-    to_calibration,
-)
+from calibgraph.tracking.assessment import Update, make_updates, to_calibration
 from calibgraph.tracking.epochs import close_epoch
 from calibgraph.tracking.estimate import (
     EpochGraph,
@@ -48,12 +44,7 @@ from calibgraph.tracking.estimate import (
     spread_of,
 )
 from calibgraph.tracking.events import Event
-from calibgraph.tracking.frames import (
-    StreamFrame,
-    frame_of,
-    prepared,
-    repeated_cameras,
-)
+from calibgraph.tracking.frames import StreamFrame, frame_of, prepared, repeated_cameras
 from calibgraph.tracking.gate import Gated
 from calibgraph.tracking.moves import (
     detect_small_step,

@@ -28,7 +28,6 @@ from calibgraph.model.rig import Camera, Rig
 from calibgraph.model.verdict import TOLERANCE, Check
 from calibgraph.parallel import map_on_cores
 from calibgraph.solver.columns import ColumnFit, Marginal, block_of, fit_columns
-from calibgraph.solver.matches import BlockResiduals
 from calibgraph.trust.evidence import Checks, Evidence, grade_by_images
 from calibgraph.trust.inputs import INTERVAL_S, MAX_FRAMES, registered_twists
 from calibgraph.trust.lens_parameter import (
@@ -188,7 +187,7 @@ def _check_camera(evidence: Evidence, name: str) -> list[Check]:
     camera, places = solution.solved_rig.cameras[name], solution.correspondences.places
     of_place = places.frames_per_place(block.frame_numbers) * evidence.findings.place_variance
     some = block.select_evenly(_MAX_MATCHES)
-    seen = some.select(BlockResiduals.at(camera.T_camera_lidar, some).projectable)
+    seen = some.select(np.isfinite(some.all_sizes(camera.T_camera_lidar[None])[0]))
     fit = fit_columns(
         seen,
         camera.T_camera_lidar,

@@ -10,7 +10,6 @@ from calibgraph.model.calibration import Residuals
 from calibgraph.model.lens import LensEstimate
 from calibgraph.model.verdict import COMMON_ERROR, Check
 from calibgraph.solver.error_model import Conflict
-from calibgraph.solver.matches import BlockResiduals
 from calibgraph.solver.robust import CAUCHY_SCALE_SIGMAS
 from calibgraph.solver.solution import Solution
 from calibgraph.trust.evidence import Checks, Estimate, Evidence
@@ -164,7 +163,7 @@ def residuals_of(solution: Solution) -> dict[str, Residuals]:
     """Per camera that has correspondences, of all of them, not only the inliers."""
     poses, scales = solution.T_camera_lidar, solution.scales
     blocks = solution.objective.blocks.items()
-    return {n: BlockResiduals.at(poses[n], block).summary(scales[n]) for n, block in blocks}
+    return {name: block.summary(poses[name], scales[name]) for name, block in blocks}
 
 
 def prior_share_checks(evidence: Evidence) -> Checks:

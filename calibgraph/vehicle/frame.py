@@ -2,8 +2,9 @@
 
 The frame has x ahead, y to the left, z up, and its origin on the road. Clouds give height, roll and
 pitch over the road: of each instant the plane of the ground near the vehicle, and over instants the
-median, whose error is by their scatter. Poses give the yaw, and the pitch of travel. What is typed
-into the rig is one more measurement. Of an axis that none of these measures nothing is known.
+median, whose error is by their scatter. Poses give the yaw and the pitch of travel, and from turns
+how far the LiDAR is ahead of the rear axle, where the origin is. What is typed into the rig is one
+more measurement. Of an axis that none of these measures nothing is known.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ _TO_DO = {
     "roll": "record at least 3 instants with road in view",
     "pitch": "record at least 3 instants with road in view",
     "yaw": "drive 50 m straight, and put the poses of the base LiDAR beside the data (poses.csv)",
-    "x": "write it into T_vehicle_lidar",
+    "x": "drive a figure eight of 100 m slowly, with poses of the base LiDAR beside the data, or "
+    "write it into T_vehicle_lidar",
     "y": "write it into T_vehicle_lidar",
     "z": "record at least 3 instants with road in view",
 }
@@ -150,13 +152,14 @@ def _by_road(T: Array, road: Road | None) -> _Measured:
 
 
 def _by_travel(T: Array, travel: Travel | None) -> _Measured:
-    """Pitch and yaw by which the direction of travel is the x axis."""
+    """Pitch and yaw by which the direction of travel is the x axis; x from turns."""
     steps, information = np.zeros(6), np.zeros(6)
     if travel is not None:
         x, y, z = T[:3, :3] @ _direction(travel)
         steps[1:3] = np.arctan2(z, np.hypot(x, y)), -np.arctan2(y, x)
         sigmas = np.array([travel.pitch_sigma_rad, travel.yaw_sigma_rad])
         information[1:3] = np.where(sigmas < _TOLD, np.maximum(sigmas, _LEAST_SIGMA) ** -2.0, 0.0)
+        steps[3], information[3] = travel.ahead_m - T[0, 3], travel.ahead_sigma_m**-2.0
     return _Measured(steps, information)
 
 

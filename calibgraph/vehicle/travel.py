@@ -4,6 +4,9 @@ A vehicle whose rear axle does not slip moves along its own x axis while it driv
 axes of the LiDAR that direction has a yaw and a pitch. Stretches in which it hardly turns are
 averaged over parts of the drive, which are the independent units: what is left of slopes, wind and
 the odometry's errors is alike within a part.
+
+In a bend the rear axle still moves along x, and a LiDAR that is ahead of it by l moves to the side
+by l times the turn. How far it is to the side only changes its speed, which poses cannot tell.
 """
 
 from __future__ import annotations
@@ -14,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from calibgraph.arrays import Array
 from calibgraph.errors import FileError
@@ -27,6 +31,8 @@ POSE_FILES = ("poses.csv", "poses.txt", "poses.tum")
 _STRETCH_M = 5.0  # of one stretch: a millimetre of odometry is 0.01 deg
 _MOST_TURN = np.radians(0.5)  # within a stretch, in which a lever arm of 2 m goes 2 cm sideways
 _PARTS, _LEAST_PARTS = 8, 4
+_SLIP_M = 0.08  # rear tyres slip by some 0.15 deg for each m/s^2: at 5.5 m/s, like so much lever
+_LEAST_TURN = np.radians(20.0)  # of a part of the drive, so that it counts
 _MATRIX, _TIME_MATRIX, _TUM = 12, 13, 8  # numbers of a line
 
 
@@ -40,6 +46,8 @@ class Travel:
         yaw_sigma_rad: standard deviation; infinite if the drive cannot tell.
         pitch_sigma_rad: likewise.
         straight_m: length of the straight stretches.
+        ahead_m: how far the LiDAR is ahead of the rear axle.
+        ahead_sigma_m: standard deviation; infinite if the drive cannot tell.
     """
 
     yaw_rad: float
@@ -47,6 +55,8 @@ class Travel:
     yaw_sigma_rad: float
     pitch_sigma_rad: float
     straight_m: float
+    ahead_m: float = 0.0
+    ahead_sigma_m: float = np.inf
 
 
 def read_poses(path: Path | str) -> tuple[Array, Array | None]:
@@ -92,8 +102,17 @@ def _pose(words: list[str], path: Path, number: int) -> tuple[Array, float | Non
 
 
 def direction_of_travel(T_world_lidar: Array) -> Travel:
-    """The mean direction of travel over the straight stretches of (n, 4, 4) poses."""
-    found = np.array([*_stretches(T_world_lidar)]).reshape(-1, 2)
+    """The mean direction of travel over the straight stretches of (n, 4, 4) poses.
+
+    And how far the LiDAR is ahead of the rear axle, from stretches that turn.
+    """
+    every = np.array([*_stretches(T_world_lidar)]).reshape(-1, 7)
+    chords = every[every[:, 6] <= _MOST_TURN, :3]
+    chords = chords[(np.hypot(*chords.T[:2]) > np.abs(chords[:, 2])) & (chords[:, 0] > 0)]
+    level = np.hypot(*chords.T[:2])  # not backwards
+    found = np.column_stack([
+        np.arctan2(chords[:, 1], chords[:, 0]), np.arctan2(-chords[:, 2], level)
+    ])  # fmt: skip
     straight_m = _STRETCH_M * len(found)
     if len(found) < 2 * _LEAST_PARTS:
         return Travel(0.0, 0.0, np.inf, np.inf, straight_m)
@@ -102,11 +121,32 @@ def direction_of_travel(T_world_lidar: Array) -> Travel:
     middle = np.median(found, axis=0)
     sigmas = means.std(axis=0, ddof=1) / np.sqrt(len(means))
     yaw, pitch, yaw_sigma, pitch_sigma = map(float, (*middle, *sigmas))
-    return Travel(yaw, pitch, yaw_sigma, pitch_sigma, straight_m)
+    ahead = np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), -np.sin(pitch)])
+    lever = _lever(every, ahead)
+    return Travel(yaw, pitch, yaw_sigma, pitch_sigma, straight_m, *lever)
 
 
-def _stretches(T_world_lidar: Array) -> Iterator[tuple[float, float]]:
-    """Yaw and pitch [rad] of the straight stretches, one behind the other."""
+def _lever(stretches: Array, ahead: Array) -> tuple[float, float]:
+    """How far the LiDAR is ahead of the rear axle, and its sigma [m], along (3,) ``ahead``."""
+    chords, turns = stretches[:, :3], stretches[:, 3:6]
+    axis = np.linalg.eigh(turns.T @ turns)[1][:, 2]  # of all turns
+    up = axis * np.sign(axis[2])
+    turned, aside = turns @ up, chords @ np.cross(up, ahead)
+    parts = np.array_split(np.column_stack([turned * aside, turned**2]), _PARTS)
+    sums = np.array([part.sum(axis=0) for part in parts])
+    if (sums[:, 1] > _LEAST_TURN**2).sum() < _LEAST_PARTS:
+        return 0.0, np.inf
+    left = sums.sum(axis=0) - sums  # the jackknife
+    without = left[:, 0] / left[:, 1]
+    spread = np.sqrt((_PARTS - 1) / _PARTS * ((without - without.mean()) ** 2).sum())
+    return float(sums[:, 0].sum() / sums[:, 1].sum()), float(np.hypot(spread, _SLIP_M))
+
+
+def _stretches(T_world_lidar: Array) -> Iterator[Array]:
+    """(7,) the way, the turn from end to end and the largest angle [rad] of each stretch.
+
+    They are in the LiDAR's axes, one behind the other; those that turn overlap.
+    """
     positions, rotations = T_world_lidar[:, :3, 3], T_world_lidar[:, :3, :3]
     along = np.concatenate([[0.0], np.linalg.norm(np.diff(positions, axis=0), axis=1).cumsum()])
     first = 0
@@ -114,14 +154,11 @@ def _stretches(T_world_lidar: Array) -> Iterator[tuple[float, float]]:
         last = int(np.searchsorted(along, along[first] + _STRETCH_M))
         if last >= len(along):
             return
-        if _turn(rotations[first : last + 1]) > _MOST_TURN:
-            first += max(1, (last - first) // 4)
-            continue
-        ahead = positions[last] - positions[first]
-        x, y, z = (ahead @ rotations[first : last + 1]).mean(axis=0)  # in the LiDAR's axes
-        if np.hypot(x, y) > abs(z) and x > 0:  # not backwards
-            yield float(np.arctan2(y, x)), float(np.arctan2(-z, np.hypot(x, y)))
-        first = last
+        way = ((positions[last] - positions[first]) @ rotations[first : last + 1]).mean(axis=0)
+        turn = Rotation.from_matrix(rotations[first].T @ rotations[last]).as_rotvec()
+        largest = _turn(rotations[first : last + 1])
+        yield np.array([*way, *turn, largest])
+        first = last if largest <= _MOST_TURN else first + max(1, (last - first) // 4)
 
 
 def _turn(rotations: NDArray[np.float64]) -> float:

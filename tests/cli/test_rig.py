@@ -192,50 +192,29 @@ def test_the_notes_about_a_bag_are_printed_and_in_the_json(call: Call, tmp_path:
     assert left.startswith("warning: left: principal point")
 
 
-def test_files_of_others_print_a_sentence_per_camera_and_make_a_rig(
-    call: Call, tmp_path: Path
+FILES_OF_OTHERS = """
+info.yaml car.urdf | front | {sentence}
+info.yaml turned.urdf | front | sits 0.40 m ahead
+nose=info.yaml car.urdf --camera-frame nose=front_link --lidar-frame base_link | nose | 1.40 m ahead
+front=calib.json --size 1646x1240 | front | front looks along LiDAR +x
+chain.yaml --rename cam0=left --rename cam1=right | left right | left sits 0.11 m left of right
+"""
+
+
+@pytest.mark.parametrize("line", FILES_OF_OTHERS.strip().splitlines())
+def test_files_of_others_make_a_rig_and_print_a_sentence_per_camera(
+    line: str, call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    info, car = write(tmp_path, info__yaml=CAMERA_INFO, car__urdf=URDF)
-    code, stdout, err = call("rig", info, car, "--out", tmp_path / "rig.yaml")
-    assert (code, stdout) == (0, "")
-    assert err.splitlines()[0] == SENTENCE
-    assert err.splitlines()[-1].startswith(f"{tmp_path / 'rig.yaml'}: written; check")
-    assert list(load_rig(tmp_path / "rig.yaml").cameras) == ["front"]
-
-
-def test_options_of_rig_reach_the_rig(call: Call, tmp_path: Path) -> None:
-    info, car = write(tmp_path, info__yaml=CAMERA_INFO, car__urdf=URDF)
-    code, _, err = call(
-        "rig", f"nose={info}", car, "--camera-frame", "nose=front_link", "--lidar-frame",
-        "base_link", "--out", tmp_path / "rig.yaml",
-    )  # fmt: skip
-    assert code == 0, err
-    assert err.startswith("nose looks along LiDAR +x, sits 1.40 m ahead, 0.10 m left and 1.80 m")
-    (tmp_path / "calib.json").write_text(json.dumps(KOIDE))
-    code, _, err = call(
-        "rig", f"front={tmp_path / 'calib.json'}", "--size", "1646x1240", "--out",
-        tmp_path / "koide.yaml",
-    )  # fmt: skip
-    assert code == 0, err
-    assert load_rig(tmp_path / "koide.yaml").cameras["front"].width_px == 1646
-
-
-def test_cameras_of_a_camchain_are_renamed_everywhere(call: Call, tmp_path: Path) -> None:
-    (chain,) = write(tmp_path, chain__yaml=KALIBR)
-    code, _, err = call(
-        "rig", chain, "--rename", "cam0=left", "--rename", "cam1=right", "--out",
-        tmp_path / "rig.yaml",
-    )  # fmt: skip
-    assert code == 0, err
-    rig = load_rig(tmp_path / "rig.yaml")
-    assert list(rig.cameras) == ["left", "right"]
-    assert [(pair.a, pair.b) for pair in rig.relative_poses] == [("right", "left")]
-
-
-def test_angles_of_a_turn_are_radians(call: Call, tmp_path: Path) -> None:
-    turned = URDF.replace('rpy="0 0 0"', 'rpy="0 0 6.2832"')
-    info, car = write(tmp_path, info__yaml=CAMERA_INFO, car__urdf=turned)
-    assert call("rig", info, car, "--out", tmp_path / "rig.yaml")[0] == 0
+    monkeypatch.chdir(tmp_path)
+    turned = URDF.replace('rpy="0 0 0"', 'rpy="0 0 6.2832"')  # by radians
+    write(tmp_path, info__yaml=CAMERA_INFO, car__urdf=URDF, turned__urdf=turned,
+          chain__yaml=KALIBR, calib__json=json.dumps(KOIDE))  # fmt: skip
+    words, names, said = (part.strip() for part in line.split("|"))
+    code, stdout, err = call("rig", *words.split(), "--out", "rig.yaml")
+    assert (code, stdout) == (0, ""), err
+    assert said.format(sentence=SENTENCE) in " ".join(err.split())
+    assert err.splitlines()[-1].startswith("rig.yaml: written; check")
+    assert [*load_rig("rig.yaml").cameras] == names.split()
 
 
 def test_millimetres_are_warned_of_by_rig_and_export(call: Call, tmp_path: Path) -> None:

@@ -15,12 +15,12 @@ K = {"fx": 718.0, "fy": 710.0, "cx": 607.0, "cy": 185.0}
 
 
 LENSES = {
-    "pinhole": Lens.pinhole(**K),
-    "radtan": Lens.pinhole(**K, distortion=RADTAN5),
-    "rational": Lens.pinhole(**K, distortion=RADTAN8),
-    "fisheye": Lens.fisheye(**K, distortion=KANNALA),
-    "omnidirectional": Lens.omnidirectional(**K, distortion=(1.2, *RADTAN5[:4])),
-    "equirectangular": Lens.equirectangular(**K),
+    "pinhole": Lens.of("pinhole", **K),
+    "radtan": Lens.of("pinhole", **K, distortion=RADTAN5),
+    "rational": Lens.of("pinhole", **K, distortion=RADTAN8),
+    "fisheye": Lens.of("fisheye", **K, distortion=KANNALA),
+    "omnidirectional": Lens.of("omnidirectional", **K, distortion=(1.2, *RADTAN5[:4])),
+    "equirectangular": Lens.of("equirectangular", **K),
 }
 
 

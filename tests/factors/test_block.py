@@ -17,6 +17,10 @@ EACH_LENS_AND_SCALE = [*((name, 3.0) for name in LENSES), ("radtan", np.inf)]
 """Of the loss; an infinite one is least squares."""
 
 
+def T_of(pose: gtsam.Pose3) -> np.ndarray:
+    return pose.inverse().matrix()[None]
+
+
 def separate(block: ProjectionBlock) -> gtsam.NonlinearFactorGraph:
     graph = gtsam.NonlinearFactorGraph()
     for k in range(len(block)):
@@ -93,13 +97,13 @@ def test_the_curvature_is_the_derivative_of_the_gradient(name: str, scale: float
 
     A loss bends at 0.03 px, so that the residuals are as wide beside them as usual.
     """
-    edges = [0, 200, 600]
+    runs = to_runs(np.array([0, 200, 600]))
     block = replace(world(LENSES[name], 600, outliers=0.0), scale=scale / 100)
     exact = block.pixels_px + block.residuals(TRUTH)[0]
     block = replace(block, pixels_px=exact + 0.01 * (block.pixels_px - exact))
-    sums, steps = block.frame_sums(TRUTH, edges, curvature=True), 1e-7 * np.eye(6)
+    sums, steps = block.summarize(T_of(TRUTH), runs, curvature=True), 1e-7 * np.eye(6)
     sides = [
-        [block.frame_sums(TRUTH.retract(s * d), edges).gradient for s in (1, -1)] for d in steps
+        [block.summarize(T_of(TRUTH.retract(s * d)), runs).gradient for s in (1, -1)] for d in steps
     ]
     for frame, (found, whole) in enumerate(zip(sums.curvature, sums.hessian, strict=True)):
         expected = np.array([ahead[frame] - behind[frame] for ahead, behind in sides]) / 2e-7
@@ -109,7 +113,9 @@ def test_the_curvature_is_the_derivative_of_the_gradient(name: str, scale: float
         assert away < 1e-12 if np.isinf(scale) else away > 0.05
     # Of another kernel, which adds in another order.
     np.testing.assert_allclose(
-        sums.hessian / whole.max(), block.frame_sums(TRUTH, edges).hessian / whole.max(), atol=1e-13
+        sums.hessian / whole.max(),
+        block.run_sums(T_of(TRUTH), runs).hessian / whole.max(),
+        atol=1e-13,
     )
 
 
@@ -149,7 +155,9 @@ def test_far_residuals_do_not_leave_the_range_of_a_float() -> None:
     """The sum of logarithms is taken as that of a product, of weights down to 1e-20 each here."""
     points = np.tile([0.0, 0.0, 1.0], (1001, 1))
     pixels = np.tile([1e6, 0.0], (1001, 1))
-    block = ProjectionBlock(Lens.pinhole(fx=1.0, fy=1.0, cx=0, cy=0), points, pixels, scale=1e-4)
+    block = ProjectionBlock(
+        Lens.of("pinhole", fx=1.0, fy=1.0, cx=0, cy=0), points, pixels, scale=1e-4
+    )
     expected = 1001 * 1e-8 * np.log1p(1e20)
     assert float(block.sums(gtsam.Pose3()).cost) == pytest.approx(expected, rel=1e-12)
 

@@ -106,7 +106,7 @@ def test_with_the_lens_held_it_is_the_block_factor(name: str) -> None:
 )
 def test_equals_factors_of_gtsam(stock, calibration, distortion, parameters) -> None:  # type: ignore[no-untyped-def]
     """Their calibration is fx, fy, skew, cx, cy and the coefficients; ours scales fx and fy."""
-    lens = Lens.pinhole(**K, distortion=distortion)
+    lens = Lens.of("pinhole", **K, distortion=distortion)
     names = ("focal", "aspect", "centre_x", "centre_y", *parameters)
     free_lens = Columns(lens, names, (1.0,) * len(names))
     block = replace(world(lens, 20), sqrt_information=None, scale=np.inf)

@@ -24,17 +24,21 @@ KANNALA = (0.02, -0.004, 0.001, -0.0002)
 MIRROR = (-0.06, 0.02, 0.001, -0.002)
 XI = [0.0, 0.7, 1.0, 1.6, 2.8]
 WIDTH, HEIGHT = 2000, 1000
-PANORAMA = Lens.equirectangular(
-    fx=WIDTH / (2 * np.pi), fy=HEIGHT / np.pi, cx=(WIDTH - 1) / 2, cy=(HEIGHT - 1) / 2
+PANORAMA = Lens.of(
+    "equirectangular",
+    fx=WIDTH / (2 * np.pi),
+    fy=HEIGHT / np.pi,
+    cx=(WIDTH - 1) / 2,
+    cy=(HEIGHT - 1) / 2,
 )
-ALL_ROUND = {f"xi {xi}": Lens.omnidirectional(**K, distortion=(xi, *MIRROR)) for xi in XI}
+ALL_ROUND = {f"xi {xi}": Lens.of("omnidirectional", **K, distortion=(xi, *MIRROR)) for xi in XI}
 ALL_ROUND["panorama"] = PANORAMA
-LENSES = {f"radtan{n}": Lens.pinhole(**K, distortion=d) for n, d in RADTAN.items()}
-LENSES["fisheye"] = Lens.fisheye(**K, distortion=KANNALA)
-LENSES["omnidirectional"] = Lens.omnidirectional(**K, distortion=(1.2, *RADTAN[4]))
-LENSES["equirectangular"] = Lens.equirectangular(**K)
-WIDE = Lens.fisheye(
-    fx=385.0, fy=384.0, cx=641.0, cy=478.0, distortion=(0.05, -0.015, 0.004, -0.001)
+LENSES = {f"radtan{n}": Lens.of("pinhole", **K, distortion=d) for n, d in RADTAN.items()}
+LENSES["fisheye"] = Lens.of("fisheye", **K, distortion=KANNALA)
+LENSES["omnidirectional"] = Lens.of("omnidirectional", **K, distortion=(1.2, *RADTAN[4]))
+LENSES["equirectangular"] = Lens.of("equirectangular", **K)
+WIDE = Lens.of(
+    "fisheye", fx=385.0, fy=384.0, cx=641.0, cy=478.0, distortion=(0.05, -0.015, 0.004, -0.001)
 )
 
 
@@ -54,7 +58,7 @@ def points_all_round(count: int = 2000) -> Array:
 @pytest.mark.parametrize("count", RADTAN)
 def test_pinhole_agrees_with_opencv(count: int) -> None:
     points = points_ahead(1, 500, 0.9)
-    pixels, valid = Lens.pinhole(**K, distortion=RADTAN[count]).project(points)
+    pixels, valid = Lens.of("pinhole", **K, distortion=RADTAN[count]).project(points)
     distortion = np.array(RADTAN[count]) if count else None
     expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), MATRIX, distortion)
     assert valid.all()
@@ -69,7 +73,7 @@ def test_fisheye_agrees_with_opencv() -> None:
     )
     assert valid.all()
     np.testing.assert_allclose(pixels, expected[:, 0], rtol=0, atol=1e-9)
-    equidistant = Lens.fisheye(**K, distortion=(0.0, 0.0, 0.0, 0.0))  # r = f theta, also behind
+    equidistant = Lens.of("fisheye", **K, distortion=(0.0,) * 4)  # r = f theta, also behind
     pixels, valid = equidistant.project([[1.0, 0.0, -0.2]])
     assert valid.all()
     np.testing.assert_allclose(pixels, [[718 * (np.pi / 2 + np.arctan(0.2)) + 607, 185.0]])
@@ -161,7 +165,9 @@ def test_rays_project_to_their_pixels_and_spreads_are_their_derivatives(lens: Le
 
 
 def test_pixels_outside_the_lens_have_no_ray() -> None:
-    folded = Lens.pinhole(fx=700.0, fy=700.0, cx=600.0, cy=200.0, distortion=(-0.4, 0.0, 0.0, 0.0))
+    folded = Lens.of(
+        "pinhole", fx=700.0, fy=700.0, cx=600.0, cy=200.0, distortion=(-0.4, 0.0, 0.0, 0.0)
+    )
     _, valid = unproject(folded, np.array([[600.0, 200.0], [3000.0, 200.0], [np.nan, 0.0]]))
     assert valid.tolist() == [True, False, False]
     _, valid = unproject(WIDE, np.array([[641.0, 478.0], [10.0, 5.0]]))  # its corner is black
@@ -196,7 +202,7 @@ def angles_deg(*angles: float) -> Array:
         (LENSES["radtan5"], [[0.1, 0.1, -5.0], [0.1, 0.1, 0.0], [0.1, 0.1, 5.0]], [0, 0, 1]),
         (PANORAMA, [[0.0, 3.0, 0.0], [0.0, -3.0, 0.0], [1e-3, 3.0, 0.0]], [0, 0, 1]),  # poles
         # Without distortion sin t / (cos t + xi) grows up to arccos(-1 / xi), 120 deg.
-        (Lens.omnidirectional(**K, distortion=(2, 0, 0, 0, 0)), angles_deg(119, 121), [1, 0]),
+        (Lens.of("omnidirectional", **K, distortion=(2, 0, 0, 0, 0)), angles_deg(119, 121), [1, 0]),
     ],
     ids=["behind", "poles", "mirror"],
 )
@@ -214,14 +220,14 @@ def test_a_distortion_is_valid_up_to_where_it_folds_back() -> None:
         ((-0.31, 0, 0, 0), np.sqrt(1 / 0.93)),  # r (1 - 0.31 r^2) grows until r^2 = 1 / 0.93
         ((-0.3, 0, 0, 0, 0, 0.1, 0, 0), 0.9857),  # until 0.03 r^4 + r^2 = 1
     ):
-        lens = Lens.pinhole(**K, distortion=distortion)
+        lens = Lens.of("pinhole", **K, distortion=distortion)
         points = np.array([[limit - 0.003, 0, 1], [limit + 0.003, 0, 1], [1.5, 0, 1]])
         assert lens.project(points)[1].tolist() == [True, False, False]
         assert np.isfinite(lens.project_with_jacobian(points)[1]).all()
 
 
 def test_where_opencv_folds_back_the_projection_goes_on() -> None:
-    lens = Lens.pinhole(**K, distortion=(-0.3, 0.0, 0.0, 0.0))
+    lens = Lens.of("pinhole", **K, distortion=(-0.3, 0.0, 0.0, 0.0))
     points = np.column_stack([[0.5, 1.05, 1.06, 1.5], np.zeros(4), np.ones(4)])
     folded = cv2.projectPoints(points, np.zeros(3), np.zeros(3), MATRIX, lens.packed[4:8])[0]
     assert folded[3, 0, 0] < folded[1, 0, 0]
@@ -244,20 +250,20 @@ def test_projection_is_continuous_and_finite_outside_its_domain(name: str) -> No
 
 
 @pytest.mark.parametrize(
-    ("make", "settings", "message"),
+    ("model", "settings", "message"),
     [
         *(
-            (Lens.pinhole, {"distortion": (0.1,) * count}, "distortion coefficients")
+            ("pinhole", {"distortion": (0.1,) * count}, "distortion coefficients")
             for count in (1, 2, 3, 6, 12)
         ),
-        *((Lens.fisheye, {"distortion": (0.1,) * count}, "expected 4") for count in (0, 3, 5)),
+        *(("fisheye", {"distortion": (0.1,) * count}, "expected 4") for count in (0, 3, 5)),
         *(
-            (Lens.omnidirectional, {"distortion": (xi, 0.0, 0.0, 0.0, 0.0)}, "xi of the unified")
+            ("omnidirectional", {"distortion": (xi, 0.0, 0.0, 0.0, 0.0)}, "xi of the unified")
             for xi in (-0.1, 101.0, np.nan)
         ),
-        (Lens.pinhole, {"fx": 0.0}, "focal"),
+        ("pinhole", {"fx": 0.0}, "focal"),
     ],
 )
-def test_an_impossible_lens_is_refused(make, settings, message) -> None:  # type: ignore[no-untyped-def]
+def test_an_impossible_lens_is_refused(model, settings, message) -> None:  # type: ignore[no-untyped-def]
     with pytest.raises(ValueError, match=message):
-        make(**{**K, **settings})
+        Lens.of(model, **{**K, **settings})

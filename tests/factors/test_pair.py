@@ -31,9 +31,15 @@ Residual = Callable[[gtsam.Pose3, gtsam.Pose3], tuple[Array, Array]]
 A, B = 3, 8
 K = {"fx": 718.0, "fy": 710.0, "cx": 607.0, "cy": 185.0}
 LENSES = {
-    "pinhole": (Lens.pinhole(**K), Lens.pinhole(**K, distortion=RADTAN5)),
-    "fisheye": (Lens.fisheye(**K, distortion=KANNALA), Lens.fisheye(**K, distortion=KANNALA)),
-    "mixed": (Lens.pinhole(**K, distortion=RADTAN5), Lens.fisheye(**K, distortion=KANNALA)),
+    "pinhole": (Lens.of("pinhole", **K), Lens.of("pinhole", **K, distortion=RADTAN5)),
+    "fisheye": (
+        Lens.of("fisheye", **K, distortion=KANNALA),
+        Lens.of("fisheye", **K, distortion=KANNALA),
+    ),
+    "mixed": (
+        Lens.of("pinhole", **K, distortion=RADTAN5),
+        Lens.of("fisheye", **K, distortion=KANNALA),
+    ),
 }
 
 T_LIDAR_A = gtsam.Pose3(gtsam.Rot3(FORWARD.T), np.array([0.3, 0.1, -0.1]))
@@ -269,7 +275,7 @@ def test_runs_have_the_sums_of_their_features_at_poses_of_their_own(kind: str) -
 
 def test_an_epipolar_residual_is_the_distance_from_the_epipolar_line() -> None:
     """Side by side, u is free and a difference of 2 px in v is one of sqrt(2) px from each line."""
-    lens = Lens.pinhole(fx=700.0, fy=700.0, cx=600.0, cy=200.0)
+    lens = Lens.of("pinhole", fx=700.0, fy=700.0, cx=600.0, cy=200.0)
     block = PairBlock.epipolar(lens, lens, np.array([[650.0, 240.0]]), np.array([[610.0, 242.0]]))
     for length in (0.1, 0.5):
         T_lidar_b = gtsam.Pose3(gtsam.Rot3(), np.array([length, 0.0, 0.0]))

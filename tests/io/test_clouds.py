@@ -341,6 +341,7 @@ def npy_header(text: str) -> bytes:
 
 SHAPE = "{'descr': '<f4', 'fortran_order': False, 'shape': %s, }"
 NO_ARRAY = "cannot be read as a .npy array"
+np.savez(ARCHIVE := io.BytesIO(), CLOUD)
 REFUSED = [
     *((f"cloud.{'ply' if b'format ' in data[:30] else 'pcd'}", data, said)
       for said, data in BROKEN.items()),
@@ -359,6 +360,7 @@ REFUSED = [
     ("truncated.npy", npy(CLOUD)[:-100], "truncated.npy"),
     ("empty.npy", b"", "empty.npy"),
     ("archive.npy", b"PK\x03\x04" + bytes(64), NO_ARRAY),
+    ("arrays.npy", ARCHIVE.getvalue(), "is an archive of arrays, expected one array"),
     *(("hostile.npy", npy_header(text), NO_ARRAY) for text in (
         SHAPE % "(100000000000, 4)", SHAPE % "(-5, 4)", SHAPE % f"(1{'0' * 400}, 4)",
         SHAPE % f"{'-' * 9000}1", SHAPE % f"{'[' * 4000}{']' * 4000}", "{" * 9000)),
@@ -366,11 +368,12 @@ REFUSED = [
       for shape in (b"(500, 3)", b"(499, 4)", b"(250, 4)")),
     ("empty.bin", b"", "empty.bin"),
     ("tiny.bin", b"12345", "tiny.bin"),
-    ("random.bin", np.random.default_rng(0).bytes(16 * 50_000), "not finite|expected metres"),
+    ("random.bin", np.random.default_rng(0).bytes(16 * 50_000), "cannot be told by its content"),
     ("odd.bin", ROWS[:5001].tobytes()[:-8], "whole number of points of 4 float32; is it complete"),
-    ("other.pcd.bin", ROWS[:5001].tobytes(), "points of 5 float32; is it complete"),
-    ("five.bin", SIX[:5001, :5].tobytes(), "write `cloud_columns: .x, y, z, intensity"),
-    ("wide.bin", ROWS.astype("<f8").tobytes(), "not finite|expected metres"),
+    ("other.pcd.bin", ROWS.tobytes(), "4 columns by its content, expected nuScenes' 5"),
+    ("turned.bin", np.ascontiguousarray(ROWS.T).tobytes(), "all x first, then all y"),
+    ("wide.bin", ROWS.astype("<f8").tobytes(), "write `cloud_columns: .x, y, z, intensity"),
+    ("round.bin", np.round(ROWS.astype("<f8") * 8).tobytes(), "cannot be told by its content"),
 ]  # fmt: skip
 
 

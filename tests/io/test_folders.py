@@ -24,16 +24,6 @@ from tests.conftest import SAMPLE
 from tests.io.written import written_kitti
 
 
-def test_the_sample_is_read() -> None:
-    data = load_dataset(SAMPLE)
-    assert list(data.rig.cameras) == ["front_left", "front_right", "left"]
-    assert [frame.name for frame in data.frames] == [f"{i:06}" for i in range(6)]
-    frame = data.frames[0]
-    assert frame.load_cloud().shape[1] == 4
-    camera = data.rig.cameras["left"]
-    assert frame.load_image("left", camera).shape == (camera.height_px, camera.width_px, 3)
-
-
 def test_several_sequences_are_one_problem(tmp_path: Path) -> None:
     folders = [written_kitti(tmp_path / name, frames) for name, frames in (("05", 2), ("06", 3))]
     data = load_dataset(folders)

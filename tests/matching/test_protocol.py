@@ -140,19 +140,10 @@ def test_every_member_is_used_in_its_turn(truth: Rig, guess: Rig) -> None:
     assert end[0] == "release"
     assert run.rematch.keys() == truth.cameras.keys() and not run.rematch_failure
     assert run.matcher.image_checks_can_fail
-
-
-def test_findings_of_the_start_and_of_the_last_round_are_in_the_table(
-    truth: Rig, guess: Rig, tmp_path: Path
-) -> None:
-    data = calibgraph.load_dataset(SAMPLE, guess)
-    run = match_in_rounds(data, matcher=Complete(truth), progress=no_progress)
-    run.correspondences.save(tmp_path / "table.parquet")
-    table = calibgraph.load_correspondences(tmp_path / "table.parquet")
-    for found in (run.correspondences.findings, table.findings):
-        assert found.z_score == dict.fromkeys(truth.cameras, 20.0)
-        assert found.found == dict.fromkeys(truth.cameras, 21.0)
-        assert found.range_rotation_deg == 7.0
+    found = run.correspondences.findings
+    assert found.z_score == dict.fromkeys(truth.cameras, 20.0), "of the last round"
+    assert found.found == dict.fromkeys(truth.cameras, 21.0), "of the start"
+    assert found.range_rotation_deg == 7.0
 
 
 FINDINGS = MatcherFindings(
@@ -180,10 +171,10 @@ def test_findings_survive_a_file(truth: Rig, tmp_path: Path) -> None:
     ("metadata", "words"),
     [
         ({"z_score": 17.5}, r"z_score: expected keys with values, .*, found 17.5"),
-        ({"missed": {"left": "far"}}, "missed.left: expected a finite number, found 'far'"),
+        ({"missed": {"left": "far"}}, "missed.left: .* valid number, found 'far'"),
         (
             {"range_rotation_deg": 270},
-            "range_rotation_deg: expected a number from 0 to 180, found 270",
+            "range_rotation_deg: .* less than or equal to 180, found 270",
         ),
     ],
 )

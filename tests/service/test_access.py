@@ -10,7 +10,6 @@ import pytest
 
 from calibgraph.errors import CalibrationError, FileError
 from calibgraph.service.app import create_app, require_safe
-from calibgraph.service.folders import open_roots
 from calibgraph.service.request_guard import STRICT_HEADERS, add_token, load_tokens
 from calibgraph.service.requests import Settings
 from tests.service.conftest import Make, Problem, make_tokens
@@ -27,7 +26,7 @@ def test_every_operation_asks_who_calls(make_server: Make, tmp_path: Path, small
     app: Any = client.app
     paths = app.openapi()["paths"] | dict.fromkeys(("/", "/docs", "/openapi.json"), {"get": {}})
     operations = [(m.upper(), path) for path, item in paths.items() for m in item]
-    assert len(operations) >= 15
+    assert len(operations) >= 14
     for method, place in operations:
         for caller, headers in callers.items():
             values = {"{id}": id, "{kind}": "solve", "{part}": "result", "{name}": "car"}
@@ -96,8 +95,3 @@ def test_without_tokens_only_loopback_is_listened_on() -> None:
     for host in ("0.0.0.0", "192.168.1.4", "example.org", "::", ""):
         with pytest.raises(CalibrationError, match="--tokens"):
             require_safe(host, has_tokens=False)
-
-
-def test_an_empty_root_is_not_the_working_folder() -> None:
-    with pytest.raises(FileError, match="--root: is empty"):
-        open_roots(("",))

@@ -34,7 +34,8 @@ def text(value: str) -> tuple[None, str]:
     ("parts", "detail"),
     [
         ([("name", text("a"))], "'rig' is missing"),
-        ([("rig", text("x"))], "'correspondences' is missing"),
+        ([("rig", b"x")], "'correspondences' is missing"),
+        ([("rig", text("x"))], "'rig' is a text; send it as a file"),
         ([("recording", b"x")], "unknown field 'recording'"),
         ([("rig", b"x"), ("rig", text("x"))], "'rig' is given 2 times"),
         ([("report", text("false"))], "unknown field 'report'; known are rig"),
@@ -147,34 +148,6 @@ def test_a_result_that_expires_meanwhile_is_not_there(
     for part in ("result", "report.html", "files.zip"):
         assert working.get(f"/v1/jobs/{solved}/{part}").status_code == 404
     assert working.get(f"/v1/jobs/{solved}/log").text == ""
-
-
-def test_counters_count(working: TestClient, solved: str) -> None:
-    lines = working.get("/metrics").text.splitlines()
-    assert any(line.startswith('calibgraph_jobs{state="succeeded"} ') for line in lines)
-    assert any(line.startswith('calibgraph_answers_total{status="202"} ') for line in lines)
-
-
-def test_uris_are_read_inside_roots_alone(
-    make_server: Make, small: Problem, tmp_path: Path
-) -> None:
-    inside = tmp_path / "drives"
-    inside.mkdir()
-    (inside / "rig.yaml").write_bytes(small.rig)
-    (inside / "table.parquet").write_bytes(small.table)
-    (tmp_path / "secret.yaml").write_bytes(small.rig)
-    (inside / "link.yaml").symlink_to(tmp_path / "secret.yaml")
-    client = make_server(roots=(str(inside),))
-
-    def status(rig: str) -> int:
-        data = {"rig": rig, "correspondences": str(inside / "table.parquet")}
-        return client.post(SOLVE, data=data, files={"settings": (None, "{}")}).status_code
-
-    assert status(str(inside / "rig.yaml")) == 202
-    outside = ("../secret.yaml", "link.yaml", "%2e%2e/secret.yaml", "gone.yaml")
-    assert [status(f"{inside}/{name}") for name in outside] == [422] * 4
-    others = ("file:///etc/passwd", "http://10.0.0.1/a", "simplecache::file:///etc", f"{inside}2")
-    assert [status(uri) for uri in others] == [422] * 4
 
 
 def zip_of_the_sample(*stems: str) -> bytes:

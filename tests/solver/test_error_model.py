@@ -107,14 +107,14 @@ def test_few_frames_add_what_is_usual_and_many_keep_their_own_scatter() -> None:
     """The gradient of one frame is zero at the solution; of ten, pseudo frames add a diagonal."""
     rng, hessian = np.random.default_rng(0), np.diag([4.0, 3.0, 2.0, 1.0])
     usual = np.diag([9.0, 8.0, 7.0, 6.0])
-    found = with_pseudo_frames(np.zeros((4, 4)), hessian, np.ones(4), usual)
+    found = with_pseudo_frames(np.zeros((4, 4)), hessian, 1.0, usual)
     np.testing.assert_allclose(found, usual)
     few, many = (rng.standard_normal((frames, 4)) for frames in (10, 4000))
     scatter = few.T @ few
-    found = with_pseudo_frames(scatter, hessian, np.full(4, 10.0))
+    found = with_pseudo_frames(scatter, hessian, 10.0)
     np.testing.assert_allclose(found, scatter + 6 / 9 * np.diag(np.diag(scatter)))
     scatter = many.T @ many
-    found = with_pseudo_frames(scatter, hessian, np.full(4, 4000.0), 100 * scatter)
+    found = with_pseudo_frames(scatter, hessian, 4000.0, 100 * scatter)
     np.testing.assert_allclose(found, scatter, rtol=0.02, atol=0.02 * scatter[0, 0])
 
 

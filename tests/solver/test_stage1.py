@@ -168,9 +168,9 @@ def test_every_frame_ends_where_levenberg_marquardt_of_gtsam_does(mixed_rig: Rig
         rows = table.of_camera(name)
         block = ProjectionBlock(camera.lens, rows.points_lidar_m, rows.pixels_px)
         runs = to_runs(np.append(np.unique(rows.frame, return_index=True)[1], len(rows)))
-        fit = fit_frames(block, runs, np.tile(camera.T_camera_lidar, (len(runs), 1, 1)))
-        assert fit.found.all()
-        for run, T in zip(runs, fit.T_camera_lidar, strict=True):
+        poses, _, found = fit_frames(block, runs, np.tile(camera.T_camera_lidar, (len(runs), 1, 1)))
+        assert found.all()
+        for run, T in zip(runs, poses, strict=True):
             alone = projection_graph(["one"], {"one": block.select(np.arange(*run))})
             found = optimize(alone, ["one"], {"one": camera.T_camera_lidar}).T_camera_lidar["one"]
             # Both stop where the cost changes by 1e-10 of itself: 1e-5 of a standard deviation,
@@ -196,11 +196,11 @@ def test_frames_that_leave_directions_free_do_not_become_singular(pair: Rig) -> 
     pixels = np.repeat(seen.pixels_px, matches, axis=0) + rng.normal(size=(len(points), 2))
     block = ProjectionBlock(camera.lens, points, pixels)
     runs = to_runs(np.arange(0, len(points) + 1, matches))
-    fit = fit_frames(block, runs, np.tile(camera.T_camera_lidar, (frames, 1, 1)))
-    assert fit.found.all()
+    T, _, found = fit_frames(block, runs, np.tile(camera.T_camera_lidar, (frames, 1, 1)))
+    assert found.all()
     # The last step changes the cost, of 5 matches of 1 px, by 1e-10 of itself: what is left to the
     # minimum is of that size.
-    sums = block.run_sums(fit.T_camera_lidar, runs)
+    sums = block.run_sums(T, runs)
     to_minimum = np.linalg.pinv(sums.hessian, rcond=1e-9, hermitian=True)
     left = np.einsum("fi,fij,fj->f", sums.gradient, to_minimum, sums.gradient)
     assert (left <= 1e-8 * sums.cost).all()

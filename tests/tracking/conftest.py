@@ -10,20 +10,11 @@ from typing import Any
 
 import pytest
 
-from calibgraph import (
-    concatenate,
-    perturb,
-)
+from calibgraph import concatenate, perturb
 from calibgraph.io.rigs import load_rig
 from calibgraph.tracking import command
 from tests.conftest import Call
-from tests.tracking.drives import (
-    World,
-    drive,
-    expected_lines,
-    file_lines,
-    pair_of,
-)
+from tests.tracking.drives import World, drive, expected_lines, file_lines, pair_of
 
 
 @pytest.fixture(scope="session")

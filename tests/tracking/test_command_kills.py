@@ -14,17 +14,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibgraph import (
-    concatenate,
-    perturb,
-)
+from calibgraph import concatenate, perturb
 from calibgraph.cli import app
 from calibgraph.tracking import durable
-from tests.tracking.drives import (
-    drive,
-    frames_in,
-    pair_of,
-)
+from tests.tracking.drives import drive, frames_in, pair_of
 
 MOST_TOGETHER = 50  # frames of one write: all its lines come again
 

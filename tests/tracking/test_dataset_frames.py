@@ -12,13 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from calibgraph import (
-    Config,
-    Correspondences,
-    DatasetError,
-    Rig,
-    concatenate,
-)
+from calibgraph import Config, Correspondences, DatasetError, Rig, concatenate
 from calibgraph.io.dataset import Dataset, load_dataset
 from calibgraph.tracking import command
 from calibgraph.tracking.command import Tracking, track

@@ -9,14 +9,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from calibgraph import (
-    Config,
-    Correspondences,
-    MatcherErrors,
-    Rig,
-    Update,
-    concatenate,
-)
+from calibgraph import Config, Correspondences, MatcherErrors, Rig, Update, concatenate
 from calibgraph.graph.objective import join
 from calibgraph.graph.variables import (
     CLOUD,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from calibgraph import Config, Correspondences, MatcherErrors, Rig, simulate_correspondences
-from calibgraph.solver.matches import BlockResiduals, CameraBlock, camera_blocks
+from calibgraph.solver.matches import CameraBlock, camera_blocks
 from calibgraph.solver.preprocess import preprocess
 from calibgraph.tracking.eliminate import eliminate
 from calibgraph.tracking.state import STRENGTHS
@@ -178,7 +178,7 @@ def test_the_gates_share_of_the_hessian_is_that_of_moved_gates(pair: Rig) -> Non
     T = pair.T_camera_lidar["left"]
     scale = matches.scale(T, Config())
     pose = gtsam.Pose3(T).inverse()
-    added = BlockResiduals.at(T, matches).gate_hessians(scale)[0]
+    added = matches.gate_hessian(T, scale)
     for axis in range(3):
         step = np.zeros(6)
         step[axis] = 4e-4  # 0.3 px, as wide as the band

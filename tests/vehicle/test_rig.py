@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import yaml
 from rich.console import Console
+from scipy.spatial.transform import Rotation
 
 import calibgraph
 from calibgraph.errors import DatasetError, FileError, RigError
@@ -129,7 +130,7 @@ def test_transforms_of_lidars_and_vehicle_are_exported(result: Calibration, tmp_
         "lidars"
     ]
     with pytest.raises(RigError, match="no camera, only LiDARs"):
-        export_calibration(result, tmp_path / "chain.yaml", "kalibr")
+        export_calibration(result, tmp_path / "camchain.yaml", "kalibr")
 
 
 @pytest.mark.parametrize(
@@ -150,6 +151,32 @@ def test_a_pose_in_the_vehicle_that_is_not_written_is_named(
     code, _, err = call("export", folder, "--format", format, "--out", tmp_path / "kit")
     assert code == 0 and named in err and not (tmp_path / "sensors_calibration.yaml").exists()
     assert ("sensors_calibration.yaml is not written" in err) == (format == "autoware")
+
+
+def test_of_a_deployed_kit_only_calibrated_rows_change(
+    result: Calibration, tmp_path: Path, call: Call
+):
+    folder, kit = result.save(tmp_path / "out").parent, tmp_path / "kit.yaml"
+    row = dict.fromkeys(("x", "y", "z", "roll", "pitch", "yaw"), 0.0)
+    rows = {"top": {**row, "z": 1.0, "yaw": 1.5}, "imu": {**row, "x": 0.7}, "front": row}
+    words = ["export", folder, "--format", "autoware", "--out", kit, "--deployed", kit, "--force"]
+    for deployed, named in (
+        ({"sensor_kit_base_link": rows}, "kit.yaml: has no row left, only front, imu, top: name"),
+        ({"sensor_kit_base_link": {"top": {"x": 1}}}, "kit.yaml: is no sensor_kit_base_link with"),
+        ({"base_link": rows}, "kit.yaml: is no sensor_kit_base_link with rows of x, y, z"),
+    ):
+        kit.write_text(yaml.safe_dump(deployed))
+        code, _, err = call(*words)
+        assert code == 2 and named in err
+    kit.write_text(yaml.safe_dump({"sensor_kit_base_link": {**rows, "left": row}}))
+    code, _, err = call(*words)
+    assert code == 0 and "imu: turned by 0.000 deg, moved by 0.00 cm" in err
+    written = yaml.safe_load(kit.read_text())["sensor_kit_base_link"]
+    assert written["imu"] == rows["imu"] and np.isclose(written["top"]["yaw"], 1.5)
+    T_kit_base = transform(Rotation.from_euler("z", 1.5), [0.0, 0.0, 1.0])
+    wanted = (T_kit_base @ result.T_base_lidar["left"])[:3, 3]
+    assert np.allclose([written["left"][key] for key in "xyz"], wanted)
+    assert f"moved by {100 * np.linalg.norm(wanted):.2f} cm" in err
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ Lenses that a format cannot carry are refused, not rounded.
 import json
 import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from shlex import quote
@@ -17,17 +17,18 @@ import cv2
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.errors import CalibrationError
+from calibgraph.errors import CalibrationError, FileError, in_words
 from calibgraph.files import read_yaml, require_new_file, write_text
 from calibgraph.io.calibrations import is_calibration, load_calibration
 from calibgraph.io.formats import EXPORT_FORMATS
 from calibgraph.io.formats.foreign_keys import DERIVED
 from calibgraph.io.kitti import CALIBRATION_NAME
-from calibgraph.io.rig_parts import Link, frame_id, quaternion_xyzw, roll_pitch_yaw
+from calibgraph.io.rig_parts import Link, frame_id, pose_of_angles, quaternion_xyzw, roll_pitch_yaw
 from calibgraph.io.rigs import load_rig, rig_file
 from calibgraph.model.calibration import FRAMES_SENTENCE, Calibration
 from calibgraph.model.geometry import (
     T_OPTICAL_LINK,
+    angle_deg,
     invert,
     point_in_lidar,
     relative_transform,
@@ -62,6 +63,7 @@ class RigExport:
         in_tree: whether the frames are those of the rig, and of the robot's tree that it knows.
         T_base_lidar: (4, 4) where the LiDAR is mounted on the vehicle or sensor kit, if given.
         lidars: those of several that are written beside the base.
+        deployed: (4, 4) of each row of the file that is replaced (autoware): others stay.
     """
 
     rig: Rig
@@ -72,6 +74,7 @@ class RigExport:
     T_base_lidar: Array | None = None
     in_tree: bool = True
     lidars: tuple[str, ...] = ()
+    deployed: Mapping[str, Array] = field(default_factory=dict)
 
     @property
     def lidar_links(self) -> list[Link]:
@@ -230,6 +233,8 @@ def write_transforms(export: RigExport, format: str) -> str:
     directions = _of_kit(export) if format == "autoware" else _of_transforms(export, format)
     statement = export.statement(*directions)
     if format == "autoware":
+        of_result = {each.child for each in links}
+        links += [Link(_KIT, n, T) for n, T in export.deployed.items() if n not in of_result]
         poses = {each.child: dict(zip(_ANGLES, _six(each), strict=True)) for each in links}
         return commented_yaml(statement, {_KIT: poses})
     return commented_xml(statement, _robot(export, links) if format == "urdf" else _launch(links))
@@ -313,6 +318,34 @@ def _sensor_kit(export: RigExport) -> list[Link]:
         T_base_camera = T_base_lidar @ export.T_lidar_camera(name)
         links.append(Link(_KIT, link, T_base_camera @ T_OPTICAL_LINK))
     return links
+
+
+def read_kit(path: Path) -> dict[str, Array]:
+    """(4, 4) of each row of Autoware's sensor_kit_calibration.yaml.
+
+    Raises:
+        FileError: if it has none, or one is malformed.
+    """
+    found = dict[str, Array]()
+    try:
+        for name, row in read_yaml(path)[_KIT].items():
+            values = [float(row[key]) for key in _ANGLES]
+            found[name] = pose_of_angles(values[:3], values[3:])
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise FileError(
+            path, f"is no {_KIT} with rows of {', '.join(_ANGLES)}: {in_words(error)}"
+        ) from None
+    return found
+
+
+def describe_changes(before: Mapping[str, Array], after: Mapping[str, Array]) -> list[str]:
+    """A line per row: how far it is turned and moved."""
+    lines = []
+    for name, T in before.items():
+        degrees = angle_deg(after[name][:3, :3] @ T[:3, :3].T)
+        centimetres = 100.0 * np.linalg.norm(after[name][:3, 3] - T[:3, 3])
+        lines.append(f"{name}: turned by {degrees:.3f} deg, moved by {centimetres:.2f} cm")
+    return lines
 
 
 def sensors_calibration(export: RigExport) -> str:
@@ -529,6 +562,7 @@ def export_calibration(  # noqa: PLR0913
     lidar_frame: str | None = None,
     camera_frame: str | None = None,
     T_base_lidar: Array | None = None,
+    deployed: Path | None = None,
     even_if_failed: bool = False,
     force: bool = False,
 ) -> tuple[Path, ...]:
@@ -544,6 +578,8 @@ def export_calibration(  # noqa: PLR0913
             rig, as its bag names it, or ``{camera}_optical_frame`` if None.
         T_base_lidar: (4, 4) pose of the LiDAR in ``sensor_kit_base_link`` (autoware); the
             identity if None.
+        deployed: a sensor_kit_calibration.yaml (autoware) that is replaced: the base LiDAR stands
+            where it has it, and only rows of what is calibrated change.
         even_if_failed: whether to write cameras whose verdict is FAIL.
         force: whether to replace files that are there.
 
@@ -558,8 +594,11 @@ def export_calibration(  # noqa: PLR0913
     """
     if format not in WRITERS:
         raise ValueError(f"format {format!r}: known are {', '.join(EXPORT_FORMATS)}")
-    if T_base_lidar is not None and format != _WITH_BASE:
-        raise ValueError(f"the LiDAR's pose is for the format {_WITH_BASE} only")
+    if not (T_base_lidar is None and deployed is None) and format != _WITH_BASE:
+        raise ValueError(
+            f"the LiDAR's pose and the deployed file are for the format {_WITH_BASE} only"
+        )
+    rows = {} if deployed is None else read_kit(deployed)
     found = _loaded(source) if isinstance(source, (str, Path)) else source
     result = found if isinstance(found, Calibration) else None
     rig = found.rig if isinstance(found, Calibration) else found
@@ -568,6 +607,8 @@ def export_calibration(  # noqa: PLR0913
     names = list(rig.cameras if cameras is None else cameras)
     others = [name for name in rig.other_lidars if name in rig.T_base_lidar]
     lidar, *optical = _frames(rig, names, lidar_frame, camera_frame)
+    if deployed is not None:
+        T_base_lidar = rows.get(lidar)
     if result is not None and not even_if_failed:
         _require_not_failed(result, [*names, *others])
     bars = {n: result.covariance.get(n) for n in names if result and result.error_bar_holds(n)}
@@ -581,7 +622,14 @@ def export_calibration(  # noqa: PLR0913
         T_base_lidar=None if T_base_lidar is None else rigid_transform(T_base_lidar),
         in_tree=lidar_frame is None and camera_frame is None,
         lidars=tuple(others),
+        deployed=rows,
     )
+    missing = [each.child for each in _sensor_kit(export) if each.child not in rows]
+    if deployed is not None and missing:
+        raise FileError(
+            deployed, f"has no row {', '.join(missing)}, only {', '.join(rows)}: name "
+            "LiDARs in the rig as there, and cameras by --camera-frame"
+        )  # fmt: skip
     return _write(export, Path(path), format, force=force)
 
 

@@ -134,11 +134,11 @@ function update(found) {
 function describe(estimate) {
   if (!estimate) return "No pairs of this camera yet; six are needed.";
   if (estimate.problem) return `${estimate.problem}. Residuals are those of the guess.`;
-  const errors = Object.entries(estimate.solver_px).map(([name, px]) => `${name} ${px.toFixed(2)} px`);
+  const sizes = estimate.residuals_px.filter(Boolean).map((px) => Math.hypot(...px)).sort((a, b) => a - b);
   const axes = (values, digits) => values.map((x) => x.toFixed(digits)).join(", ");
   const bar = estimate.sigma_deg === null ? "The pairs leave a direction free."
     : `1 sigma about and along x, y, z: ${axes(estimate.sigma_deg, 3)} deg; ${axes(estimate.sigma_cm, 1)} cm.`;
-  return `PnP, median error: ${errors.join(", ")}. ${bar}`;
+  return `Median residual: ${(sizes[sizes.length >> 1] ?? NaN).toFixed(2)} px. ${bar}`;
 }
 
 function redraw() {

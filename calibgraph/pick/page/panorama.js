@@ -25,7 +25,7 @@ export class Panorama {
   // The colour of every point, 0 to 1: its rank, so that all of the scale is used.
   shades(kind) {
     if (!this.colours[kind]) {
-      const values = kind === "range" ? this.range : kind === "height" ? this.heights() : this.intensities();
+      const values = kind === "range" ? this.range : this.intensities();
       const order = Array.from(values.keys()).sort((a, b) => values[a] - values[b]);
       const shades = new Float32Array(values.length);
       order.forEach((i, rank) => { shades[i] = rank / Math.max(1, order.length - 1); });
@@ -36,17 +36,6 @@ export class Panorama {
 
   intensities() {
     return Float32Array.from(this.range, (_, i) => this.cloud[4 * i + 3] || 0);
-  }
-
-  // Height above the lowest point within two metres.
-  heights() {
-    const lowest = new Map();
-    const cell = (i) => `${Math.floor(this.cloud[4 * i] / 2)},${Math.floor(this.cloud[4 * i + 1] / 2)}`;
-    for (let i = 0; i < this.range.length; i++) {
-      const z = this.cloud[4 * i + 2];
-      if (!(lowest.get(cell(i)) < z)) lowest.set(cell(i), z);
-    }
-    return Float32Array.from(this.range, (_, i) => this.cloud[4 * i + 2] - lowest.get(cell(i)));
   }
 
   draw(context, view, kind) {

@@ -1,6 +1,5 @@
-// A canvas that zooms and pans over content of a stated size, with a cross and a loupe.
+// A canvas that zooms and pans over content of a stated size, with a cross.
 
-const LOUPE = 160; // pixels of the screen
 const CLICK = 4; // pixels that a click may move
 
 export class View {
@@ -127,39 +126,20 @@ export class View {
       context.setTransform(this.ratio, 0, 0, this.ratio, 0, 0);
       context.clearRect(0, 0, this.canvas.clientWidth, this.canvas.clientHeight);
       this.draw(context, this);
-      if (this.cross) this.loupe(context);
+      if (this.cross) this.drawCross(context);
     });
   }
 
-  // What is around the cross, enlarged, in the corner that is farther from it.
-  loupe(context) {
+  drawCross(context) {
     const [x, y] = this.cross;
-    const { clientWidth: width } = this.canvas;
-    const left = x < width / 2 ? width - LOUPE - 6 : 6;
-    const scale = Math.max(8, 4 * this.scale);
-    const [u, v] = this.toContent(this.cross);
-    const inner = Object.create(this);
-    inner.scale = scale;
-    inner.origin = [u - LOUPE / 2 / scale, v - LOUPE / 2 / scale];
-    inner.inLoupe = true;
-    context.save();
-    context.translate(left, 6);
-    context.beginPath();
-    context.rect(0, 0, LOUPE, LOUPE);
-    context.clip();
-    context.fillStyle = "#111";
-    context.fillRect(0, 0, LOUPE, LOUPE);
-    this.draw(context, inner);
     context.strokeStyle = "#fff";
-    context.strokeRect(0.5, 0.5, LOUPE - 1, LOUPE - 1);
-    line(context, [LOUPE / 2 - 12, LOUPE / 2], [LOUPE / 2 + 12, LOUPE / 2]);
-    line(context, [LOUPE / 2, LOUPE / 2 - 12], [LOUPE / 2, LOUPE / 2 + 12]);
-    context.restore();
+    line(context, [x - 12, y], [x + 12, y]);
+    line(context, [x, y - 12], [x, y + 12]);
   }
 
   // The part of the content that is visible: left, top, right, bottom.
   visible() {
-    const [width, height] = this.inLoupe ? [LOUPE, LOUPE] : [this.canvas.clientWidth, this.canvas.clientHeight];
+    const { clientWidth: width, clientHeight: height } = this.canvas;
     const [left, top] = this.origin;
     return [left, top, left + width / this.scale, top + height / this.scale];
   }

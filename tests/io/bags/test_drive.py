@@ -245,20 +245,33 @@ def pair(  # noqa: PLR0913
 SHARED = [("velodyne", "stereo", invert(T_LEFT_LIDAR))]
 
 
-def test_the_baseline_in_P_counts_where_the_frame_is_that_of_the_first(tmp_path: Path) -> None:
-    bag = pair(tmp_path, ("stereo", "stereo"), SHARED)
+T_OWN_RIGHT = np.eye(4)  # R turns the axes of the image into those of the own frame
+T_OWN_RIGHT[:3, :3] = T_RIGHT_LEFT[:3, :3].T
+FRAMES: dict[str, tuple[list[tuple[str, str, Any]], str]] = {  # of the second camera
+    "stereo": (
+        SHARED,
+        f"front_right: P of its camera_info states a baseline of "
+        f"{np.linalg.norm(T_RIGHT_LEFT[:3, 3]):.3f} m; it is added, as frame 'stereo' is at that "
+        "of /front_left/camera_info"),
+    "stereo_again": ([*SHARED, ("stereo", "stereo_again", np.eye(4))], "it is added, as frame"),
+    "right": (
+        [*SHARED, ("velodyne", "right", invert(T_OWN_RIGHT @ T_RIGHT_LIDAR))],
+        "; frame 'right' is its own, so it is not added"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("frame", FRAMES)
+def test_the_baseline_in_P_is_added_where_the_frame_lies_at_that_of_the_first(
+    tmp_path: Path, frame: str
+) -> None:
+    edges, said = FRAMES[frame]
+    bag = pair(tmp_path, ("stereo", frame), edges)
     rig = rig_of_bag(bag)
     np.testing.assert_allclose(rig.T_camera_lidar["front_left"], T_LEFT_LIDAR, atol=1e-12)
     np.testing.assert_allclose(rig.T_camera_lidar["front_right"], T_RIGHT_LIDAR, atol=1e-9)
-    (note,) = read_bag_rig(bag).notes
-    length_m = float(np.linalg.norm(T_RIGHT_LEFT[:3, 3]))
-    assert note == (
-        f"front_right: P of its camera_info states a baseline of {length_m:.3f} m; it is added, as "
-        "frame 'stereo' is at that of /front_left/camera_info"
-    )
-    assert (rig.cameras["front_left"].frame_id, rig.cameras["front_right"].frame_id) == (
-        "stereo", None
-    )  # fmt: skip
+    assert said in read_bag_rig(bag).notes[0]
+    if frame == "stereo":
+        assert [each.frame_id for each in rig.cameras.values()] == ["stereo", None]
 
 
 @pytest.mark.parametrize("shift", [(-0.12, 0.0, 0.0), (0.0, 0.2, 0.0), (0.3, -0.1, 0.02)])
@@ -272,27 +285,6 @@ def test_a_baseline_along_any_axis_parts_the_cameras_as_recorded_and_rectified(
     expected[:3, 3] = shift
     found = relative_transform(T["front_right"], T["front_left"])
     np.testing.assert_allclose(found, expected, atol=1e-9)
-
-
-def test_a_baseline_that_the_frames_have_is_not_added(tmp_path: Path) -> None:
-    T_right_own = np.eye(4)  # R turns the own frame into the axes of the image
-    T_right_own[:3, :3] = T_RIGHT_LEFT[:3, :3]
-    T_own_lidar = invert(T_right_own) @ T_RIGHT_LIDAR
-    own = [*SHARED, ("velodyne", "right", invert(T_own_lidar))]
-    bag = pair(tmp_path, ("stereo", "right"), own)
-    np.testing.assert_allclose(
-        rig_of_bag(bag).T_camera_lidar["front_right"], T_RIGHT_LIDAR, atol=1e-9
-    )
-    notes = read_bag_rig(bag).notes
-    assert notes[0].endswith("; frame 'right' is its own, so it is not added")
-
-
-def test_a_baseline_is_added_to_another_frame_at_the_same_place(tmp_path: Path) -> None:
-    twice = [*SHARED, ("stereo", "stereo_again", np.eye(4))]
-    bag = pair(tmp_path, ("stereo", "stereo_again"), twice)
-    np.testing.assert_allclose(
-        rig_of_bag(bag).T_camera_lidar["front_right"], T_RIGHT_LIDAR, atol=1e-9
-    )
 
 
 @pytest.mark.parametrize("rectified", [False, True])

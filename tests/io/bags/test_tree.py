@@ -260,12 +260,6 @@ def test_a_message_of_a_pairs_second_camera_counts_its_baseline_on_request() -> 
     assert not camera_from_message(info, np.eye(4), rectified=True).T_camera_lidar[:3, 3].any()
 
 
-def test_an_uncalibrated_camera_is_named() -> None:
-    info = MAKE.camera_info(make_camera(), "eye", K=np.zeros(9))
-    with pytest.raises(FileError, match="here: K: .* holds no focal length"):
-        lens_of(info, "here", rectified=False)
-
-
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return sample_bag(tmp_path_factory.mktemp("bag"), "mcap")
