@@ -268,7 +268,7 @@ def track(
     from calibgraph.cli.settings import read_settings
     from calibgraph.io.rigs import load_rig
     from calibgraph.model.result_files import require_result_folder
-    from calibgraph.tracking.command import Tracking, track
+    from calibgraph.tracking.command import open_drive, track
     from calibgraph.tracking.state import require_poses_alone
 
     require_result_folder(out, [rig, *source])
@@ -282,16 +282,13 @@ def track(
             chosen = None
         else:
             chosen = matcher_from(matcher, weights, seed=settings.seed, of_cmrnext=rare.of_cmrnext)
-    wanted = Tracking(
-        rig=load_rig(rig),
-        config=settings,
-        out=out,
-        every=step,
-        matcher=chosen,
-        interval_s=interval_s,
-        bag=bag_options_from(topic, motion=motion, **rare.of_bags),
-    )
-    result, written = track(wanted, source, notify=print_line)
+    guess, drive = load_rig(rig), None
+    if chosen is not None:
+        bag = bag_options_from(topic, motion=motion, **rare.of_bags)
+        drive = open_drive(
+            source, guess, settings, matcher=chosen, every=step, interval_s=interval_s, bag=bag
+        )
+    result, written = track(guess, source, config=settings, out=out, notify=print_line, drive=drive)
     _print_and_exit(result, written, as_json=False)
 
 

@@ -62,32 +62,25 @@ def absorb(state: State, gated: Mapping[int, Gated]) -> list[dict[int, int]]:
         return used
     cameras = np.repeat([*kept], [len(one.counts) for one in kept.values()])
     numbers = np.concatenate([one.raw.frame_numbers for one in kept.values()])
-    rows = np.searchsorted(state.numbers, numbers)
+    rows, closed = np.searchsorted(state.numbers, numbers), state.closed
     sums, packed = sums_of(state, kept), state.sums.packed.copy()
     packed[rows, cameras] = sums.packed
     state.sums = Sums(packed)
     counts = sums.matches.astype(np.int64)
     for row, camera, count in zip(rows.tolist(), cameras.tolist(), counts.tolist(), strict=True):
-        used[row - state.closed][camera] = count
-    agreements = [*state.agreements]
+        if row >= closed:
+            used[row - closed][camera] = count
+    agreements, whole = [*state.agreements], state.counts.copy()
+    blocks, inliers = [*state.blocks], [*state.inliers]
     for camera, one in kept.items():
         agreed = (*agreements[camera], *((n, True) for n in one.raw.frame_numbers.tolist()))
         agreements[camera] = agreed[-_LAST_FRAMES:]
-    state.agreements = tuple(agreements)
-    keep_matches(state, kept)
+        blocks[camera] = (*blocks[camera], one.raw)
+        inliers[camera] = (*inliers[camera], one.inliers)
+        whole[camera] += _ABSORBED @ [len(one.inliers), int(one.counts.sum()), len(one.counts)]
+    state.agreements, state.counts = tuple(agreements), whole
+    state.blocks, state.inliers = tuple(blocks), tuple(inliers)
     return used
-
-
-def keep_matches(state: State, gated: Mapping[int, Gated]) -> None:
-    """Keep the matches of absorbed frames, and count them."""
-    blocks, inliers, counts = [*state.blocks], [*state.inliers], state.counts.copy()
-    for camera, one in gated.items():
-        blocks[camera], inliers[camera] = (
-            (*blocks[camera], one.raw),
-            (*inliers[camera], one.inliers),
-        )
-        counts[camera] += _ABSORBED @ [len(one.inliers), int(one.counts.sum()), len(one.counts)]
-    state.blocks, state.inliers, state.counts = tuple(blocks), tuple(inliers), counts
 
 
 def add_to_totals(state: State, frames: Sums) -> None:
@@ -321,16 +314,11 @@ def absorb_again(
     state.settled, state.steps = (), state.steps[:0]
     state.weights, state.shared = state.weights[:0], np.zeros_like(state.shared)
     if blocks:
-        raw, scale = merge(blocks), state.scales[camera]
+        raw = merge(blocks)
         raw = raw.select(np.argsort(raw.frame, kind="stable"))
         raw = raw.select(np.isin(raw.frame, state.numbers))
-        gated = Gated.at(T_camera_lidar, raw, scale)
-        gated = gated.select(gated.enough)
-        if len(gated.raw):
-            rows = np.searchsorted(state.numbers, gated.raw.frame_numbers)
-            sums = sums_of(state, {camera: gated})
-            state.sums = state.sums.replace_at((rows, camera), sums)
-            keep_matches(state, {camera: gated})
+        if len(raw):
+            absorb(state, {camera: Gated.at(T_camera_lidar, raw, state.scales[camera])})
     own, bends = state.matches_of(camera), state.bends[camera].copy()
     kept = None if own is None else own[0].select(own[1])  # follow the distortion in another way
     bends[:54] = _bends_of(state, camera, kept)[:54] if kept else 0.0

@@ -35,38 +35,52 @@ STATE_FOLDER = "state"
 _TOGETHER = 50  # frames of a table that are taken in by one write
 
 
-@dataclass(frozen=True, kw_only=True)
-class Tracking:
-    """The arguments of ``calibgraph track``.
+def open_drive(
+    source: Sequence[Path], rig: Rig, config: Config, *, matcher: Matcher, every: int = 1,
+    interval_s: float | None = None, bag: BagOptions | None = None,
+) -> DatasetDrive:  # fmt: skip
+    """Dataset folders or bags as one drive.
 
-    Attributes:
+    Args:
+        source: the folders.
         rig: the initial guess.
         config: settings.
-        out: folder for the state and the result.
-        every: of datasets, match every so-many-th frame.
-        matcher: for the frames of datasets; None for tables.
+        matcher: of the frames.
+        every: match every so-many-th frame.
         interval_s: between neighbouring clouds of folders, whose registration shows the motion.
         bag: how bags are read.
-    """
 
-    rig: Rig
-    config: Config
-    out: Path
-    every: int = 1
-    matcher: Matcher | None = None
-    interval_s: float | None = None
-    bag: BagOptions | None = None
+    Raises:
+        CalibrationError: if they cannot be used.
+    """
+    try:
+        data = load_dataset(source, rig, bag=bag, interval_s=interval_s)
+    except ValueError as error:  # of an option: a wrong argument of the user
+        raise DatasetError(str(error)) from error
+    full = FullMatcher(matcher)
+    require_different_images(data, rig)
+    data = hide_burnt_in(replace(data, frames=data.frames[::every]), rig)
+    return DatasetDrive(data, full, config.changed(stage1=full.stage1))
 
 
 def track(
-    settings: Tracking, source: Sequence[Path], *, notify: Notify
+    rig: Rig,
+    source: Sequence[Path],
+    *,
+    config: Config,
+    out: Path,
+    notify: Notify,
+    drive: DatasetDrive | None = None,
 ) -> tuple[Calibration, list[Path]]:
     """Track a source until it ends or a signal comes; a line of JSON per update on stdout.
 
     Args:
-        settings: see there.
-        source: a table, or -; with a matcher, dataset folders.
+        rig: the initial guess.
+        source: a table, or -; the folders of a drive.
+        config: settings.
+        out: folder for the state and the result.
         notify: called with warnings and events as sentences.
+        drive: of which the frames are; None: of the source.
 
     Returns:
         The last estimate; the files written.
@@ -75,22 +89,30 @@ def track(
         CalibrationError: if the source, the rig or the state cannot be used, or there is no frame.
     """
     require_stdout()
-    settings.rig.require_cameras()
-    waits = str(source[0]) == "-"  # frames come at their own times
+    rig.require_cameras()
+    state, waits = out / STATE_FOLDER, str(source[0]) == "-"  # frames come at their own times
     with _stopped_by_signals() as stop:
         if waits:
             warm_up_tracker()
-        items, calibrator = _opened(settings, source, notify)
+        if drive is None:
+            items: Iterator[Item] = frames_of(str(source[0]))
+            calibrator = DurableCalibrator(state, rig, config)
+        else:
+            begin = partial(_first_rig, drive, rig, notify)
+            calibrator = DurableCalibrator(state, rig, drive.config, begin=begin)
+            items = drive.items(calibrator.tracker)
+        if calibrator.resumed:
+            notify(f"going on after frame {calibrator.tracker.frame}")
         gc.freeze()  # what is loaded by now stays: each full collection would visit it, for 0.1 s
         run = Run(calibrator, notify)
         with calibrator:
-            run.follow(items, 1 if waits or settings.matcher is not None else _TOGETHER, stop)
+            run.follow(items, 1 if waits or drive is not None else _TOGETHER, stop)
             if calibrator.tracker.frame is None and not stop.received:
                 held = f"held no frame that could be used ({run.left_out} left out); check it"
                 raise FileError("standard input" if waits else source[0], held)
-            result = _result(calibrator.tracker, settings)
+            result = _result(calibrator.tracker, rig, state)
     run.report_counts()
-    return result, [result.save(settings.out)]
+    return result, [result.save(out)]
 
 
 @dataclass
@@ -160,7 +182,7 @@ class Run:
                 self.notify(f"frame {event.detected_frame}: {event}")
 
 
-def _result(tracker: IncrementalCalibrator, settings: Tracking) -> Calibration:
+def _result(tracker: IncrementalCalibrator, guess: Rig, state: Path) -> Calibration:
     """That of the guess, not of where the first batch has located it.
 
     A camera without an estimate fails at the end, as one that `calibrate` does not find.
@@ -171,8 +193,7 @@ def _result(tracker: IncrementalCalibrator, settings: Tracking) -> Calibration:
         why = str(error).strip().partition("\n")[0]
         raise CalibrationError(
             f"after frame {tracker.frame} the error bar cannot be solved for ({why}); all updates "
-            f"are in {settings.out / STATE_FOLDER}, and the same command goes on from there with "
-            "more frames"
+            f"are in {state}, and the same command goes on from there with more frames"
         ) from error
     verdicts = {
         name: replace(one, checks=tuple(
@@ -180,36 +201,7 @@ def _result(tracker: IncrementalCalibrator, settings: Tracking) -> Calibration:
         ))
         for name, one in result.camera_verdicts.items()
     }  # fmt: skip
-    return replace(result, initial_rig=settings.rig, camera_verdicts=verdicts)
-
-
-def _opened(
-    settings: Tracking, source: Sequence[Path], notify: Notify
-) -> tuple[Iterator[Item], DurableCalibrator]:
-    """The frames of the source, and the durable tracker."""
-    folder = settings.out / STATE_FOLDER
-    if settings.matcher is None:
-        items = frames_of(str(source[0]))
-        calibrator = DurableCalibrator(folder, settings.rig, settings.config)
-    else:
-        drive = _drive(settings, settings.matcher, source)
-        begin = partial(_first_rig, drive, settings.rig, notify)
-        calibrator = DurableCalibrator(folder, settings.rig, drive.config, begin=begin)
-        items = drive.items(calibrator.tracker)
-    if calibrator.resumed:
-        notify(f"going on after frame {calibrator.tracker.frame}")
-    return items, calibrator
-
-
-def _drive(settings: Tracking, matcher: Matcher, source: Sequence[Path]) -> DatasetDrive:
-    try:
-        data = load_dataset(source, settings.rig, bag=settings.bag, interval_s=settings.interval_s)
-    except ValueError as error:  # of an option: a wrong argument of the user
-        raise DatasetError(str(error)) from error
-    full = FullMatcher(matcher)
-    require_different_images(data, settings.rig)
-    data = hide_burnt_in(replace(data, frames=data.frames[:: settings.every]), settings.rig)
-    return DatasetDrive(data, full, settings.config.changed(stage1=full.stage1))
+    return replace(result, initial_rig=guess, camera_verdicts=verdicts)
 
 
 def _first_rig(drive: DatasetDrive, guess: Rig, notify: Notify) -> Rig:

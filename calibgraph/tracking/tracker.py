@@ -81,7 +81,7 @@ class IncrementalCalibrator:
     @property
     def rig(self) -> Rig:
         """The rig with the present estimates."""
-        return self.calibration().rig
+        return self._state.rig_at(self._present().T_camera_lidar)
 
     @property
     def initial_rig(self) -> Rig:
@@ -106,9 +106,11 @@ class IncrementalCalibrator:
 
     def calibration(self) -> Calibration:
         """The present estimate as a batch's result."""
-        graph = self._graph_of(self._state)
-        self._estimate = self._estimate or graph.solve(self._state)
-        return to_calibration(self._state, self._estimate)
+        return to_calibration(self._state, self._present())
+
+    def _present(self) -> Estimate:
+        self._estimate = self._estimate or self._graph_of(self._state).solve(self._state)
+        return self._estimate
 
     def update(
         self, table: Correspondences, *, frame: int | None = None, place: str | int | None = None

@@ -19,7 +19,7 @@ from pyarrow import parquet
 
 from calibgraph import Config, Correspondences, concatenate
 from calibgraph.tracking import command
-from calibgraph.tracking.command import Tracking, track
+from calibgraph.tracking.command import track
 from tests.conftest import Call
 from tests.tracking.drives import (
     FRAMES,
@@ -160,13 +160,12 @@ def test_a_second_signal_ends_it_at_once_and_loses_nothing(
             signal.raise_signal(signal.SIGINT)
 
     lines = io.BytesIO(as_lines(world.tables))
-    wanted = Tracking(rig=world.guess, config=Config(), out=tmp_path)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may ignore it
     try:
         with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
             patch.setattr(command, "print_line", write)
             patch.setattr(sys, "stdin", SimpleNamespace(buffer=lines))
-            track(wanted, [Path("-")], notify=print)
+            track(world.guess, [Path("-")], config=Config(), out=tmp_path, notify=print)
     finally:
         signal.signal(signal.SIGINT, before)
     _, out, _ = piped(world.rig, as_lines(world.tables), "--out", tmp_path)

@@ -15,7 +15,7 @@ import pytest
 from calibgraph import Config, Correspondences, DatasetError, Rig, concatenate
 from calibgraph.io.dataset import Dataset, load_dataset
 from calibgraph.tracking import command
-from calibgraph.tracking.command import Tracking, track
+from calibgraph.tracking.command import open_drive, track
 from tests.tracking.drives import FRAMES, Crashed, World
 
 pytestmark = pytest.mark.usefixtures("not_warmed_up")
@@ -82,9 +82,10 @@ def test_a_dataset_continues_after_a_crash_and_around_an_unreadable_frame(
             given.append(line)
 
         monkeypatch.setattr(command, "print_line", write)
-        wanted = Tracking(rig=recorded.rig, config=Config(), out=out, matcher=matcher)
+        drive = open_drive(recorded.folders, recorded.rig, Config(), matcher=matcher)
+        wanted = {"config": Config(), "out": out, "drive": drive}
         try:
-            track(wanted, recorded.folders, notify=messages.append)
+            track(recorded.rig, recorded.folders, notify=messages.append, **wanted)
         except Crashed:
             assert crash is not None
         return given, messages
