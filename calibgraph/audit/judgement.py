@@ -16,7 +16,7 @@ from collections.abc import Collection, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import chdtri, ndtri, stdtrit
+from scipy.special import chdtri, fdtri, ndtri, stdtrit
 
 from calibgraph.arrays import Array, Mask
 from calibgraph.audit.result import CameraAudit, LidarAudit
@@ -24,7 +24,7 @@ from calibgraph.model.error_sources import MATCHES, MOST_TIMES, ErrorSources
 from calibgraph.model.findings import UNKNOWN, MatcherFindings, error_components
 from calibgraph.model.geometry import to_T_lidar_camera, twist_between
 from calibgraph.solver.covariance import ENOUGH_FRAMES, PSEUDO_FRAMES
-from calibgraph.tracking.cause import Steps, find_cause
+from calibgraph.tracking.cause import Steps, find_cause, squared_sigmas
 from calibgraph.trust.evidence import Evidence
 from calibgraph.trust.probability import probability_outside
 from factors import pose_sigmas
@@ -129,6 +129,7 @@ def judge_deviation(
     *,
     least: Array | float = 0.0,
     axes: tuple[str, ...] = CAMERA_AXES,
+    together: float = np.inf,
 ) -> tuple[str, str]:
     """The status of a trusted measurement, and its reason.
 
@@ -139,9 +140,12 @@ def judge_deviation(
         tolerance: (2,) of the turn [rad] and of the shift [m].
         least: (6,) share of sigma that remains however many frames are recorded.
         axes: (6) their names.
+        together: squared sigmas of a turn or a shift from which on all its axes are significant.
     """
     sigma, (largest, confident) = np.sqrt(np.diag(covariance)), quantiles
     significant = np.abs(deviation) > largest * sigma
+    for part in (slice(3), slice(3, 6)):
+        significant[part] |= squared_sigmas(deviation[part], covariance[part, part]) > together
     wrong = axes_beyond(deviation, significant, tolerance)
     if wrong.any():
         return "WRONG", describe_motion(deviation, sigma, wrong, axes)
@@ -272,6 +276,12 @@ def student_quantiles(freedom: ArrayLike, tail: float) -> Array:
     """
     freedom = np.broadcast_to(np.asarray(freedom, np.float64), 6)
     return np.array([-stdtrit(freedom, tail), stdtrit(freedom, CONFIDENCE)])
+
+
+def limit_together(freedom: float, sensors: int) -> float:
+    """Squared sigmas that a turn or a shift exceeds by chance: Hotelling's distribution."""
+    quantile = fdtri(3, freedom - 2, 1 - FALSE_ALARM_RATE / (2 * sensors))
+    return float(3 * freedom / (freedom - 2) * quantile)
 
 
 def quantiles_in_part(share: Array, estimated: Array, known: Array) -> Array:

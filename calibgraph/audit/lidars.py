@@ -17,6 +17,7 @@ from calibgraph.audit.judgement import (
     SINGLE_LIDAR,
     detectable,
     judge_deviation,
+    limit_together,
     student_quantiles,
     tail_of_axis,
 )
@@ -30,6 +31,7 @@ from calibgraph.progress import Progress
 from calibgraph.vehicle.lidars import PLACE_FREEDOM
 from calibgraph.vehicle.rig import LidarResult, calibrate_rig_lidars
 
+_LEAST_FREEDOM = 3.0  # of one place, where the size is a prior
 _UNUSABLE = ("lidar_matched", "lidar_start")  # kinds of checks
 
 
@@ -90,11 +92,12 @@ def measure_lidars(
     covariance = _covariance(found, deployed)
     freedom = freedom_of_places(found.poses.places, len(names))
     quantiles = student_quantiles(freedom, tail_of_axis(sensors))
+    together = limit_together(freedom, sensors)
     audits = {}
     for row, name in enumerate(names):
         own = covariance[6 * row : 6 * row + 6, 6 * row : 6 * row + 6]
         status, reason = judge_deviation(
-            deviations[row], own, quantiles, tolerance, axes=LIDAR_AXES
+            deviations[row], own, quantiles, tolerance, axes=LIDAR_AXES, together=together
         )
         if doubt := _doubt(found, name):
             status, reason = "CANNOT TELL", doubt
@@ -109,7 +112,7 @@ def measure_lidars(
 
 def freedom_of_places(places: int, lidars: int) -> float:
     """Degrees of freedom of the covariance of LiDARs from so many places."""
-    return PLACE_FREEDOM + 3.0 * lidars * (places - 1)
+    return max(PLACE_FREEDOM + 3.0 * lidars * (places - 1), _LEAST_FREEDOM)
 
 
 def _covariance(found: LidarResult, deployed: Rig) -> Array:

@@ -13,7 +13,7 @@ from calibgraph.arrays import Array
 from calibgraph.graph.variables import camera_key
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.geometry import relative_transform
-from calibgraph.model.rig import RelativePose, Rig
+from calibgraph.model.rig import Rig
 from factors import (
     ProjectionBlock,
     block_factor,
@@ -26,7 +26,7 @@ from factors import (
 # fmt: off
 __all__ = [  # with the factors that calibgraph re-exports
     "block_factor", "camera_prior_factor", "join", "objective_graph", "pose_key",
-    "projection_factor", "projection_graph", "relative_pose_factor", "relative_pose_graph",
+    "projection_factor", "projection_graph", "relative_pose_factor",
     "relative_prior_factor",
 ]
 # fmt: on
@@ -42,22 +42,6 @@ def projection_graph(
 ) -> gtsam.NonlinearFactorGraph:
     """The reprojection term: one lossless block factor per camera that has correspondences."""
     return _graph(block_factor(pose_key(cameras, name), block) for name, block in blocks.items())
-
-
-def relative_pose_graph(
-    cameras: Sequence[str], relative_poses: Iterable[RelativePose]
-) -> gtsam.NonlinearFactorGraph:
-    """Independently known relative poses of the rig, with their own sigmas."""
-    return _graph(
-        relative_pose_factor(
-            pose_key(cameras, pair.a),
-            pose_key(cameras, pair.b),
-            pair.T_a_b,
-            rotation_sigma_rad=pair.rotation_sigma_rad,
-            translation_sigma_m=pair.translation_sigma_m,
-        )
-        for pair in relative_poses
-    )
 
 
 # fmt: off
@@ -90,7 +74,9 @@ def objective_graph(
     key = {name: pose_key(cameras, name) for name in cameras}
     return join(                                              # minimize over T_1 ... T_N:
         projection_graph(cameras, blocks),                    # sum rho(|w (u - pi(T_i, p))|^2)
-        relative_pose_graph(cameras, rig.relative_poses),     # + measured relative poses (ours)
+        _graph(relative_pose_factor(                          # + measured relative poses (ours)
+                   key[one.a], key[one.b], one.T_a_b, rotation_sigma_rad=one.rotation_sigma_rad,
+                   translation_sigma_m=one.translation_sigma_m) for one in rig.relative_poses),
         _graph(camera_prior_factor(key[i], T, weight=lambda_)  # + lambda sum |log(T_hat^-1 T)|^2
                for i, T in T_hat.items() if lambda_ > 0),
         _graph(relative_prior_factor(                         # + mu |log(T_hat_12^-1 T_2 T_1^-1)|^2

@@ -80,7 +80,6 @@ def relative_pose_conflict(
 Numbers = NDArray[np.int64]
 
 _ROUNDS = 3  # of fits and estimates of the variance ratios
-_COARSE_TOLERANCE = 1e-4  # relative change of the cost, meanwhile
 
 
 def refine_with_error_model(
@@ -164,20 +163,18 @@ def fit_errors(at: FittedObjective, findings: MatcherFindings, places: Places) -
         return None
     frames = split_frames(inliers, places)
     model = error_model(at, findings, frames)
-    prior, ratios = model.components, VarianceRatios()
-    fit = fit_latent_poses(
-        model, start_values(model, at.T_camera_lidar), relative_tolerance=_COARSE_TOLERANCE
+    prior, ratios, linear = (
+        model.components,
+        VarianceRatios(),
+        start_values(model, at.T_camera_lidar),
     )
+    fit = fit_latent_poses(model, linear) if linear.is_determined() else None
     for _ in range(_ROUNDS):
         found = ratios if fit is None else estimate_variance_ratios(fit.linear, ratios)
         if fit is None or found.is_near(ratios):
             break
         model, ratios = replace(model, components=found.scale(prior)), found
-        fit = fit_latent_poses(
-            model, fit.linear, relative_tolerance=_COARSE_TOLERANCE, is_determined=True
-        )
-    if fit is not None and not (fit.model is model and fit.converged):
-        fit = fit_latent_poses(model, fit.linear, is_determined=True)
+        fit = fit_latent_poses(model, fit.linear)
     return None if fit is None else replace(fit, ratios=ratios)
 
 

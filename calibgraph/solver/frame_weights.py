@@ -240,8 +240,8 @@ def _reach(shift: Array, least: float, *, widened: bool) -> float:
         least: displacement by the noise of a typical frame.
         widened: whether the wider reach is wanted.
     """
-    nearest_first = np.sort(shift)
-    two, three = (max(math.sqrt(_of_nearest(nearest_first, fewest=n)), least) for n in (2, 3))
+    nearest_first, share = np.sort(shift), math.ceil(_NEAREST_SHARE * len(shift))
+    two, three = (max(math.sqrt(nearest_first[max(n, share) - 1]), least) for n in (2, 3))
     if not widened:
         return _SEARCH_REACH * two
     nearest = two if three > _FAR_THIRD * two else three
@@ -256,17 +256,6 @@ def densest_start(block: CameraBlock, frames: FrameFits, T_camera_lidar: Array) 
     return candidates[block.best_candidate(candidates, scale_px)]
 
 
-def _of_nearest(shift: Array, *, fewest: int) -> float:
-    """The displacement within which the nearest share of the frames lies, or the fewest of them.
-
-    Args:
-        shift: (f,) ascending.
-        fewest: frames.
-    """
-    nearest = max(fewest, int(np.ceil(_NEAREST_SHARE * len(shift))))
-    return float(shift[nearest - 1])
-
-
 def confidence_sigmas(sizes: Array, confidence: Array) -> Array:
     """(n,) standard deviations of errors as a function of the confidence, over their median.
 
@@ -278,13 +267,14 @@ def confidence_sigmas(sizes: Array, confidence: Array) -> Array:
     """
     known = np.flatnonzero(np.isfinite(sizes))
     order = known[_rising(confidence[known])]
-    if count_groups(len(order)) == 1 or confidence[order[0]] == confidence[order[-1]]:
+    parts = min(_CONFIDENCE_BINS, len(order) // _BIN_MATCHES)  # of as many matches
+    if parts < 2 or confidence[order[0]] == confidence[order[-1]]:  # noqa: PLR2004
         return np.ones(len(sizes))
-    groups = _equal_runs(len(order), count_groups(len(order)))
-    spreads = robust_spreads(sizes[order], groups)
+    groups = to_runs(np.linspace(0, len(order), parts + 1).astype(np.int64))
+    spreads = np.maximum(robust_spreads(sizes[order], groups), _MIN_SIZE)
     counts, ordered = groups[:, 1] - groups[:, 0], confidence[order]
     middles = (ordered[(groups.sum(axis=1) - 1) // 2] + ordered[groups.sum(axis=1) // 2]) / 2
-    falling = falling_logarithms(spreads, counts)
+    falling: Array = isotonic_regression(np.log(spreads), weights=counts, increasing=False).x
     in_order = np.exp(np.interp(ordered, middles, falling))  # in order, places are found faster
     if len(order) == len(sizes):  # they fall
         learnt = in_order / ((in_order[(len(order) - 1) // 2] + in_order[len(order) // 2]) / 2)
@@ -304,27 +294,3 @@ def _rising(confidence: Array) -> NDArray[np.int64]:
     bits = confidence.astype(np.float32).view(np.uint32).astype(np.uint64)
     keys = np.sort(bits << np.uint64(32) | np.arange(len(bits), dtype=np.uint64))
     return (keys & np.uint64(0xFFFFFFFF)).astype(np.int64)
-
-
-def _equal_runs(count: int, parts: int) -> NDArray[np.int64]:
-    """(parts, 2) runs of so many rows, the longer ones first, which differ by one at most."""
-    sizes = np.full(parts, count // parts)
-    sizes[: count % parts] += 1
-    return to_runs(np.concatenate([[0], np.cumsum(sizes)]))
-
-
-def count_groups(matches: int) -> int:
-    """Into how many groups of equal size matches are divided by their confidence; 1: too few."""
-    return max(1, min(_CONFIDENCE_BINS, matches // _BIN_MATCHES))
-
-
-def falling_logarithms(spreads: Array, counts: NDArray[np.int64]) -> Array:
-    """(g,) logarithms of the spreads of groups of rising confidence, made monotone.
-
-    Args:
-        spreads: (g,) of the groups.
-        counts: (g,) their matches.
-    """
-    logarithms = np.log(np.maximum(spreads, _MIN_SIZE))
-    falling: Array = isotonic_regression(logarithms, weights=counts, increasing=False).x
-    return falling

@@ -1,5 +1,6 @@
 """The method: section 3 of the paper in one function, :func:`solve_joint`."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -230,17 +231,12 @@ def count_common_features(
     counts: Mapping[str, Mapping[str, int]], pairs: Sequence[PairTerm]
 ) -> dict[str, dict[str, int]]:
     """The counts, with the features of each camera that is part of a pair."""
-    features: dict[str, int] = {}
+    features = Counter[str]()
     for pair in pairs:
-        for name in (pair.a, pair.b):
-            features[name] = features.get(name, 0) + len(pair.frame)
-    others = {
-        name: {key: value for key, value in of_camera.items() if key != "common_features"}
-        for name, of_camera in counts.items()
-    }
+        features.update({name: len(pair.frame) for name in (pair.a, pair.b)})
     return {
-        name: {**of_camera, "common_features": features[name]} if name in features else of_camera
-        for name, of_camera in others.items()
+        name: {**own, "common_features": features[name]} if name in features else dict(own)
+        for name, own in counts.items()
     }
 
 

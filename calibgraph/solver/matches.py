@@ -33,14 +33,13 @@ from calibgraph.solver.robust import (
     sqrt_information,
     whitened_norm,
 )
-from factors import ProjectionBlock, to_runs
+from factors import ProjectionBlock
 
 MIN_MATCHES = 6
 """Of fewer correspondences a pose (three determine it) leaves too few residuals to check it by."""
 
 _MAX_SAMPLE = 5000  # correspondences for a choice of candidates: a mean loss is known to 1 or 2 %
 _GATE_BAND = 0.1  # relative half width of the band about the gate whose density is measured
-_FIRST = 1000  # correspondences: if one of them is projectable, the others need not be evaluated
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,24 +187,18 @@ class CameraBlock:
 
     def scale(self, T_camera_lidar: Array, config: Config) -> ResidualScale:
         """The configured scales, or those of the residuals' own spread at a T_camera_lidar."""
-        if config.loss_scale_px is not None and config.gate_px is not None:
-            unmeasured = math.nan if self._any_projectable(T_camera_lidar) else math.inf
-            return ResidualScale(1.0, config.loss_scale_px, config.gate_px, unmeasured)
         sizes_px, sizes = self.all_sizes(T_camera_lidar[None])
+        if config.loss_scale_px is not None and config.gate_px is not None:
+            unmeasured = math.nan if np.isfinite(sizes_px).any() else math.inf
+            return ResidualScale(1.0, config.loss_scale_px, config.gate_px, unmeasured)
         spread_px = robust_spread(sizes_px)
         spread = spread_px if sizes is sizes_px else robust_spread(sizes)
         return scale_from(spread_px, max(spread, self.least_spread), config)
 
-    def _any_projectable(self, T_camera_lidar: Array) -> bool:
-        """Whether any correspondence is in front of the camera: mostly, one of the first is."""
-        first = self.select(np.arange(min(_FIRST, len(self.frame))))
-        sizes = (some.all_sizes(T_camera_lidar[None])[0] for some in (first, self))
-        return any(np.isfinite(each).any() for each in sizes)
-
     @cached_property
     def least_spread(self) -> float:
         """MIN_SIGMA_PX as a whitened residual."""
-        return float(self.least_spreads(to_runs(np.array([0, len(self.frame)])))[0])
+        return float(self.least_spreads(np.array([[0, len(self)]]))[0])
 
     def least_spreads(self, runs: NDArray[np.int64]) -> Array:
         """(r,) MIN_SIGMA_PX as a whitened residual, in each of (r, 2) runs."""

@@ -451,23 +451,16 @@ class ErrorFit:
 
 
 def fit_latent_poses(
-    model: LatentPoseModel,
-    start: Linearization,
-    *,
-    relative_tolerance: float = TOLERANCE,
-    is_determined: bool = False,
+    model: LatentPoseModel, start: Linearization, *, relative_tolerance: float = TOLERANCE
 ) -> ErrorFit | None:
-    """Minimize by Gauss-Newton with steps that descend; None if a direction is not determined.
+    """Minimize by Gauss-Newton with steps that descend; None where the algebra fails.
 
     Args:
         model: the graph.
         start: at some values, of a model of the same data.
         relative_tolerance: relative change of the cost at which it stops.
-        is_determined: whether all directions are known to be; else that is tested.
     """
     present = start if start.model is model else start.with_model(model)
-    if not (is_determined or present.is_determined()):
-        return None
     change = np.inf
     for _ in range(MAX_ITERATIONS):
         try:

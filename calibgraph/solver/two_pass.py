@@ -338,13 +338,11 @@ def best_start(
                 start.setdefault(pair.b, invert(pair.T_a_b) @ start[pair.a])
         for one, other in (*tied, *((b, a) for a, b in tied)):
             if one in start:
-                start.setdefault(other, _by_guess(rig, other, one) @ start[one])
+                T_other_one = relative_transform(
+                    *(rig.cameras[n].T_camera_lidar for n in (other, one))
+                )
+                start.setdefault(other, T_other_one @ start[one])
     return {name: start.get(name, camera.T_camera_lidar) for name, camera in rig.cameras.items()}
-
-
-def _by_guess(rig: Rig, to: str, of: str) -> Array:
-    """(4, 4) T_to_of between two cameras by their guesses."""
-    return relative_transform(rig.cameras[to].T_camera_lidar, rig.cameras[of].T_camera_lidar)
 
 
 def _candidates(

@@ -75,8 +75,8 @@ def _search_checks(findings: MatcherFindings, camera: str, chance: float | None)
         text = (
             "its image and cloud agree at its pose, but features that it has in common with "
             f"{other} place the two cameras elsewhere: do both images show the same thing that is "
-            "no part of the scene, as a text, a logo or a part of the vehicle? Else one of the two "
-            "is wrong"
+            "no part of the scene, as a text, a logo or a part of the vehicle? Are the clouds not "
+            "corrected for the motion during a scan? Else one of the two is wrong"
         )
         name = f"features in common with {other}"
         checks.append(Check(name, "WARN", text, kind="contradiction"))

@@ -56,7 +56,8 @@ THRESHOLDS: tuple[Threshold, ...] = (
     Threshold("pair_agreement", "relative pose of two cameras by images", "at most", 1.75, 4.0,
               "sigma", "Do the images of two cameras place them relative to each other as the "
               "correspondences do?", "one of the two is wrong: check their intrinsics and the "
-              "guesses, and that their images are of one instant and not swapped"),
+              "guesses, that their images are of one instant and not swapped, and that the clouds "
+              "are corrected for the motion during a scan"),
     # Poses near a result are within 3 sigma of the matches; a larger ratio is of poses elsewhere.
     # The wider sigma is the error bar, so that the check changes no verdict.
     Threshold("flat_evidence", "sigma by the images over that by the matches", "at most", 3.0,

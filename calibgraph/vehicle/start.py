@@ -37,9 +37,7 @@ opencalib) right placements have 18 and more, 0.75 and more, but for one of 6; c
 have up to 11, and with more than 5 up to 1.0."""
 _ROUNDS, _MOST_PLANES = 9, 2000  # of refining
 _PEAK_DEG, _PEAK_M, _BAND_DEG = 10.0, 1.5, 15.0  # about one that has been tried; a similar heading
-_OFF = (
-    4  # power of the share: a plane beside another's is rarer where poses are right than one on it
-)
+_POWER = 4  # of the share in a score: where poses are right, a plane off another's is rare
 _AS_GOOD = 0.85  # of the best score
 _OTHER_DEG, _OTHER_M = 5.0, 0.5  # from which a placement is another one
 _GROUND = 0.3  # of the points on the plane that holds most; planes that are neither have up to 0.15
@@ -67,7 +65,7 @@ class _Placement(NamedTuple):
 
     @property
     def score(self) -> float:
-        return self.on * self.share**_OFF
+        return self.on * self.share**_POWER
 
 
 _Placed = Mapping[str, tuple[_Seen, Array]]

@@ -98,7 +98,7 @@ def drive() -> str:
 def test_remote_data_are_copied_up_to_the_limit_and_local_ones_read_in_place(
     tmp_path: Path, drive: str
 ) -> None:
-    with pytest.raises(FileError, match=r"expected up to 7e-09 \(--fetch-gb of fleet"):
+    with pytest.raises(FileError, match=r"expected up to 7e-09 \(--fetch-gb"):
         fetch(drive, tmp_path, 7)
     assert not list(tmp_path.iterdir())
     copied = fetch(drive, tmp_path, 1e6)

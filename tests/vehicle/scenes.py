@@ -23,6 +23,9 @@ MOUNTS = {
 """(4, 4) T_base_lidar; the base is ``top``."""
 
 
+ALL_AROUND_DEG = np.arange(-180.0, 180.0, 1.0)
+
+
 def draw_place(rng: np.random.Generator, *, boxes: int = 14, fronts: bool = True) -> Array:
     """(n, 2, 3) corners of the boxes of a place [m]: houses, cars; x ahead, z over the road."""
     found = []
@@ -46,10 +49,10 @@ def flat_street() -> Array:
 
 
 def scan(boxes: Array, T_road_lidar: Array, rng: np.random.Generator, *, beams: int = 20,
-         noise_m: float = 0.015) -> Array:  # fmt: skip
+         noise_m: float = 0.015, azimuths_deg: Array = ALL_AROUND_DEG) -> Array:  # fmt: skip
     """(n, 3) what a spinning LiDAR measures of boxes and the ground, in its frame."""
     azimuth, elevation = np.meshgrid(
-        np.radians(np.arange(-180.0, 180.0, 1.0)), np.radians(np.linspace(-28.0, 14.0, beams))
+        np.radians(azimuths_deg), np.radians(np.linspace(-28.0, 14.0, beams))
     )
     flat = np.cos(elevation)
     rays = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], -1)

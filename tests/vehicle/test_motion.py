@@ -12,7 +12,7 @@ import calibgraph
 from calibgraph.arrays import Array
 from calibgraph.errors import DatasetError
 from calibgraph.model.geometry import transform
-from tests.vehicle.scenes import HEIGHT_M, MOUNTS, draw_place, scan
+from tests.vehicle.scenes import ALL_AROUND_DEG, HEIGHT_M, MOUNTS, draw_place, scan
 
 START_NS, SLICES, SCAN_S = 1_700_000_000_000_000_000, 12, 0.1
 LATE_S = {"top": 0.0, "front": 0.03}  # the begin of its scan after the instant's stamp
@@ -28,11 +28,10 @@ def pose_at(seconds: float, speed_m_s: float) -> Array:
 def sweep(boxes: Array, lidar: str, speed_m_s: float, rng: np.random.Generator) -> np.ndarray:
     """(n,) x, y, z and the times of points [ns] while the vehicle drives."""
     parts = []
-    for number in range(SLICES):
+    for number, azimuths_deg in enumerate(np.split(ALL_AROUND_DEG, SLICES)):
         seconds = LATE_S[lidar] + SCAN_S * (number + 0.5) / SLICES
-        points = scan(boxes, pose_at(seconds, speed_m_s) @ MOUNTS[lidar], rng)
-        turned = (np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi) + 0.5) % 1.0
-        points = points[np.floor(SLICES * turned) == number]
+        T_road_lidar = pose_at(seconds, speed_m_s) @ MOUNTS[lidar]
+        points = scan(boxes, T_road_lidar, rng, azimuths_deg=azimuths_deg)
         parts += [(*point, round(1e9 * seconds)) for point in points.tolist()]
     return np.array(parts, dtype=[("x", "f4"), ("y", "f4"), ("z", "f4"), ("t", "u4")])
 
