@@ -24,8 +24,10 @@ ABOUT_THE_DATA = frozenset({
     "failed_frames", "frames", "image evidence", "images", "lidar_instants", "lidar_loose",
     "lidar_start", "no_error_bar", "prior_share", "repeated_frames", "sigma_rotation",
     "sigma_translation", "terms", "went_on",
+    "beyond_tolerance", "difference between even and odd frames", "focal_sensitivity",
 })  # fmt: skip
-"""Kinds of checks that count data: beyond a limit, nothing seems wrong yet."""
+"""Kinds of checks that count data: beyond a limit, nothing seems wrong yet. The last line is of
+results of earlier versions."""
 WENT_ON = "went_on"
 """Kind of the check of a camera whose pose was chosen by the images' posterior: it does not fail,
 and keeps from a PASS, since the same posterior cannot vouch for it."""

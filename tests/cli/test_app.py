@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from calibgraph import Rig, load_rig
 from calibgraph.cli import app
 from calibgraph.parallel import count_cores
 from tests.cli.conftest import error_line
@@ -123,8 +124,11 @@ def test_commands_need_no_package_of_an_extra(tmp_path: Path) -> None:
         f"evaluate {SAMPLE}/rig.yaml {SAMPLE}/reference.yaml",
         f"rig {SAMPLE}/rig.yaml",
         f"doctor {SAMPLE} --frames 0:2",
-        f"calibrate {SAMPLE} --frames 0:2 --search-deg 4 --search-m 0.3 --out {tmp_path}/out",
+        f"calibrate {SAMPLE} --rig {tmp_path}/one.yaml --frames 0:2 --search-deg 4 --search-m 0.3 "
+        f"--out {tmp_path}/out",
     )
+    one = {"front_left": load_rig(SAMPLE).cameras["front_left"]}
+    Rig(cameras=one).save(tmp_path / "one.yaml")
     words = [sys.executable, "-c", WITHOUT_EXTRAS, *lines]
     done = subprocess.run(words, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
