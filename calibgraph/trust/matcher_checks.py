@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 
 from calibgraph.matching.run import MatchingRun, RoundSummary
-from calibgraph.matching.structure.acceptance import FEW_FRAMES, SEARCH, probability_by_chance
+from calibgraph.matching.structure.acceptance import (
+    FEW_FRAMES,
+    SEARCH,
+    Chance,
+    probability_by_chance,
+)
 from calibgraph.matching.structure.global_search import ALONE
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import pose_difference
@@ -17,7 +21,7 @@ from calibgraph.trust.evidence import Checks, Evidence
 from calibgraph.trust.inputs import describe_copies, describe_repeats
 from calibgraph.trust.thresholds import threshold
 
-_OF_FEW_FRAMES = replace(SEARCH, sigma=0.0)  # in which the search has measured the location
+_OF_FEW_FRAMES = Chance(5.7, 0.0, SEARCH.scale)  # in which the search has measured the location
 
 
 def matcher_checks(evidence: Evidence) -> Checks:
