@@ -368,11 +368,12 @@ REFUSED = [
       for shape in (b"(500, 3)", b"(499, 4)", b"(250, 4)")),
     ("empty.bin", b"", "empty.bin"),
     ("tiny.bin", b"12345", "tiny.bin"),
-    ("random.bin", np.random.default_rng(0).bytes(16 * 50_000), "not finite|expected metres"),
+    ("random.bin", np.random.default_rng(0).bytes(16 * 50_000), "cannot be told by its content"),
     ("odd.bin", ROWS[:5001].tobytes()[:-8], "whole number of points of 4 float32; is it complete"),
-    ("other.pcd.bin", ROWS[:5001].tobytes(), "points of 5 float32; is it complete"),
-    ("five.bin", SIX[:5001, :5].tobytes(), "write `cloud_columns: .x, y, z, intensity"),
-    ("wide.bin", ROWS.astype("<f8").tobytes(), "not finite|expected metres"),
+    ("other.pcd.bin", ROWS.tobytes(), "4 columns by its content, expected nuScenes' 5"),
+    ("turned.bin", np.ascontiguousarray(ROWS.T).tobytes(), "all x first, then all y"),
+    ("wide.bin", ROWS.astype("<f8").tobytes(), "write `cloud_columns: .x, y, z, intensity"),
+    ("round.bin", np.round(ROWS.astype("<f8") * 8).tobytes(), "cannot be told by its content"),
 ]  # fmt: skip
 
 
