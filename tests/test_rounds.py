@@ -158,6 +158,16 @@ def test_rounds_go_on_from_where_the_images_say(run: MatchingRun) -> None:
     assert "ended 0.6 deg" in check.text
 
 
+def test_of_several_modes_the_end_that_agrees_best_is_taken(run: MatchingRun) -> None:
+    """The densest is farther away; the second is right."""
+    wrong, right = displaced(run, AWAY, z_score=1.0), run.solution.T_camera_lidar[ONE]
+    farther, back = (told(twist, share=0.9) for twist in (AWAY, -AWAY))
+    both = replace(back, elsewhere=np.vstack([farther.elsewhere, back.elsewhere]))
+    after = follow(wrong, both, told(np.zeros(6), share=0.1))
+    degrees, centimetres = pose_difference(after.solution.T_camera_lidar[ONE], right)
+    assert degrees < 0.1 and centimetres < 2.0
+
+
 @pytest.mark.parametrize(("z_score", "late"), [(1e3, False), (1.0, True)])
 def test_an_end_that_agrees_less_is_not_taken_and_the_time_limit_holds(
     run: MatchingRun, z_score: float, late: bool
