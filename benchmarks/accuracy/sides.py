@@ -143,9 +143,10 @@ COLUMNS = (
 
 def _cells(found: Sequence[Record], within: tuple[float, float]) -> tuple[str, ...]:
     deg, cm = (np.array([one[f"error_{unit}"] for one in found]) for unit in ("deg", "cm"))
-    bars = np.array([np.sqrt(np.diag(one["covariance"])) for one in found if one["covariance"]])
+    known = [one for one in found if one.get("covariance")]  # of streets together it is not kept
+    bars = np.array([np.sqrt(np.diag(one["covariance"])) for one in known] or [np.full(6, np.nan)])
     sigma = np.median(bars.reshape(-1, 2, 3).max(axis=2), axis=0) * (np.degrees(1.0), 100.0)
-    nees = [one["normalised_squared"] for one in found if one["covariance"]]
+    nees = [one["normalised_squared"] for one in found if one.get("normalised_squared")]
     status = [one["status"] for one in found]
     inside = ((deg <= within[0]) & (cm <= within[1])).sum()
     return (
