@@ -31,6 +31,7 @@ from benchmarks.accuracy.uncertainty import calibration
 from benchmarks.accuracy.verdicts import STATUSES, class_of
 from benchmarks.tables import ROOT, Table
 from calibgraph import (
+    Calibration,
     Config,
     Correspondences,
     RelativePose,
@@ -126,11 +127,8 @@ def render_street(
     return stated, aligned
 
 
-def run_case(case: Key, scenes: Path) -> Record:
-    """Render one street, calibrate from near the truth, keep the tables beside it."""
-    folder = scenes / f"scene_{case.seed}"
-    truth, aligned = render_street(folder, group_of(case.seed), case.seed, size=float(case.data))
-    guess = perturb(truth, rotation_deg=GUESS_DEG, translation_m=GUESS_M, seed=case.seed)
+def calibrate_street(folder: Path, guess: Rig) -> Calibration:
+    """Calibrate a street, and keep the tables beside it."""
     guess.save(folder / "rig.yaml")
     result = calibrate(load_dataset(folder), guess)
     assert result.correspondences is not None
@@ -138,6 +136,15 @@ def run_case(case: Key, scenes: Path) -> Record:
     if result.camera_matches is not None:
         result.camera_matches.save(folder / "camera_matches.parquet")
     result.rig.save(folder / "result.yaml")
+    return result
+
+
+def run_case(case: Key, scenes: Path) -> Record:
+    """Render one street, calibrate from near the truth, keep the tables beside it."""
+    folder = scenes / f"scene_{case.seed}"
+    truth, aligned = render_street(folder, group_of(case.seed), case.seed, size=float(case.data))
+    guess = perturb(truth, rotation_deg=GUESS_DEG, translation_m=GUESS_M, seed=case.seed)
+    result = calibrate_street(folder, guess)
     spreads = {name: r.sigma_px for name, r in result.residuals.items()}
     return {**ledger.to_record(result, aligned), "spread_px": spreads,
             "z_score": dict(result.correspondences.findings.z_score),

@@ -25,13 +25,14 @@ from benchmarks.accuracy.error_bars import (
     FRAMES,
     STEP_M,
     STREETS,
+    calibrate_street,
     group_parser,
     load_streets,
     solve_streets,
 )
 from benchmarks.accuracy.ledger import Key, Record
 from benchmarks.tables import Table
-from calibgraph import Intrinsics, Rig, calibrate, load_dataset, load_rig, perturb
+from calibgraph import Intrinsics, Rig, load_rig, perturb
 from calibgraph.simulation.lidar import lidar_of, ring_gains, scan
 from calibgraph.simulation.recording import build_drive
 from calibgraph.simulation.rigs import rig_of
@@ -94,13 +95,7 @@ def run_case(case: Key, scenes: Path) -> Record:
     for rig, name in ((stated, "reference.yaml"), (aligned, ALIGNMENT)):
         rig.save(folder / name)
     guess = perturb(stated, rotation_deg=2.0, translation_m=0.1, seed=case.seed)
-    guess.save(folder / "rig.yaml")
-    result = calibrate(load_dataset(folder), guess)
-    assert result.correspondences is not None
-    result.correspondences.save(folder / "correspondences.parquet")
-    if result.camera_matches is not None:
-        result.camera_matches.save(folder / "camera_matches.parquet")
-    result.rig.save(folder / "result.yaml")
+    result = calibrate_street(folder, guess)
     return ledger.to_record(result, aligned)
 
 
