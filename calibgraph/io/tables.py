@@ -19,7 +19,6 @@ from calibgraph.model.camera_matches import COLUMNS, FORMAT, NAMES, NUMBERS, PLA
 from calibgraph.model.correspondences import (
     COORDINATES,
     INFORMATION,
-    OPTIONAL_WHOLE,
     TWIST,
     Correspondences,
     as_confidence,
@@ -187,7 +186,7 @@ def _from_plain_columns(table: pa.Table) -> Correspondences:
         else np.ones(len(table), np.float32),
         information_px=stack(INFORMATION) if INFORMATION[0] in given else None,
         twist_per_s=stack(TWIST) if TWIST[0] in given else None,
-        **{name: _whole(table, name) for name in OPTIONAL_WHOLE if name in given},
+        stamp_ns=_whole(table, "stamp_ns") if "stamp_ns" in given else None,
         metadata=json.loads((table.schema.metadata or {}).get(b"matcher", b"{}")),
     )
 

@@ -29,14 +29,13 @@ def test_a_file_returns_the_same_table(suffix: str, tmp_path: Path) -> None:
     given = table(
         information_px=[[1, 0, 1], [2, 0.5, 1], [1, 1, 1], [4, 0, 0]],
         stamp_ns=[1, 2, 2, 1_700_000_000_123_456_789],
-        point_index=[7, -1, 0, 2**40],
         metadata={"matcher": "by hand", "settings": {"k": 1}},
     )
     path = tmp_path / f"table{suffix}"
     given.save(path)
     read = load_correspondences(path)
     assert [read.cameras[i] for i in read.camera_index] == ["left", "left", "right", "left"]
-    for name in ("frame", "pixels_px", "points_lidar_m", "confidence", "stamp_ns", "point_index"):
+    for name in ("frame", "pixels_px", "points_lidar_m", "confidence", "stamp_ns"):
         np.testing.assert_array_equal(getattr(read, name), getattr(given, name))
     np.testing.assert_array_equal(read.information_px, given.information_px)
     if suffix == ".parquet":
@@ -45,11 +44,11 @@ def test_a_file_returns_the_same_table(suffix: str, tmp_path: Path) -> None:
 
 
 def test_a_table_written_by_another_tool_is_read(tmp_path: Path) -> None:
-    """Plain strings, float32, no confidence, no metadata, columns in another order."""
+    """Plain strings, float32, no confidence or metadata, other order, a column of older tables."""
     columns = {
         "x_m": np.float32([1.5, 2]), "y_m": np.float32([0, 1]), "z_m": np.float32([0, 1]),
         "u_px": np.float32([5, 6]), "v_px": np.float32([7, 8]),
-        "frame": [3, 4], "camera": ["a", "b"],
+        "frame": [3, 4], "camera": ["a", "b"], "point_index": [7, -1],
     }  # fmt: skip
     path = tmp_path / "table.parquet"
     parquet.write_table(pa.table(columns), path)
