@@ -180,6 +180,11 @@ class _Map:
 
     def lens(self) -> tuple[CameraLens, str]:
         """The lens, and a note on what was assumed; empty if nothing was."""
+        window = self._content.get("roi")
+        binned = [self._content.get(key) not in (None, 0, 1) for key in ("binning_x", "binning_y")]
+        if any(binned) or (isinstance(window, dict) and any(window.values())):
+            raise FileError(self._where, "states binning or a window (roi), which only bags are "
+                            "read with: give the lens of the images as they are")  # fmt: skip
         model, coefficients, note = self._distortion(stated_model(self._content, self._where))
         shift = self._key("time_offset_s")
         offset_s = None if shift is None else self._number(shift)

@@ -5,8 +5,7 @@ import shlex
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Annotated, Any, TypeVar
+from typing import Any, TypeVar
 from xml.etree import ElementTree
 
 import numpy as np
@@ -18,7 +17,6 @@ from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError, FileError
 from calibgraph.files import checked_model, read_json, read_text, require_file
 from calibgraph.io.bags import is_bag
-from calibgraph.io.bags.camera_info import lens_of
 from calibgraph.io.bags.rig import read_bag_rig
 from calibgraph.io.formats.foreign_keys import Foreign, read_foreign
 from calibgraph.io.kitti import CALIBRATION_NAME
@@ -40,7 +38,7 @@ from calibgraph.io.rig_parts import (
 )
 from calibgraph.io.rigs import is_exported_rig, read_rig
 from calibgraph.model.geometry import T_OPTICAL_LINK
-from calibgraph.model.rig import KNOWLEDGE, Finite, Mount, Rig, Size
+from calibgraph.model.rig import KNOWLEDGE, Finite, Mount, Rig
 from calibgraph.yaml_text import parse_yaml_documents
 
 _PUBLISHER = "static_transform_publisher"
@@ -297,12 +295,8 @@ def _read_content(documents: list[dict[str, Any]], path: Path, name: str | None)
     content = documents[0]
     if is_tf2(content):
         return read_tf2(documents, path)
-    if _is_camera_info(content):
-        documents = [content, *(each for each in documents if _message(each) != _message(content))]
     if len(documents) > 1:
-        raise FileError(path, f"holds {len(documents)} different YAML documents; keep one of them")
-    if _is_camera_info(content):
-        return _read_camera_info(content, path, name)
+        raise FileError(path, f"holds {len(documents)} YAML documents; keep one of them")
     if "format" in content or is_exported_rig(content):
         return _part_of_rig(path)
     if is_autoware(content):
@@ -312,59 +306,6 @@ def _read_content(documents: list[dict[str, Any]], path: Path, name: str | None)
         keys = ", ".join(str(key) for key in list(content)[:5])
         raise FileError(path, _unknown(f"its keys ({keys}) are"))
     return found
-
-
-def _message(content: dict[str, Any]) -> dict[str, Any]:
-    """A message without its header, whose stamp changes."""
-    return {**content, "header": None}
-
-
-_Count = Annotated[int, Field(ge=0, le=1_000_000)]
-
-
-_Nine = Annotated[list[Finite], Field(min_length=9, max_length=9)]
-_Twelve = Annotated[list[Finite], Field(min_length=12, max_length=12)]
-
-
-class _Header(Foreign):
-    frame_id: str = ""
-
-
-class _Window(Foreign):
-    x_offset: _Count = 0
-    y_offset: _Count = 0
-    height: _Count = 0
-    width: _Count = 0
-
-
-class _Message(Foreign):
-    header: _Header = _Header()
-    height: Size
-    width: Size
-    distortion_model: str
-    d: list[Finite]
-    k: _Nine
-    r: _Nine
-    p: _Twelve
-    binning_x: _Count = 0
-    binning_y: _Count = 0
-    roi: _Window = _Window()
-
-
-def _is_camera_info(content: dict[str, Any]) -> bool:
-    """Whether the content of a file is a CameraInfo message, as ``ros2 topic echo`` prints it."""
-    keys = {str(key).lower() for key in content}  # in capitals: K of ROS 1
-    return {"height", "width", "distortion_model", "k", "d", "p"} <= keys
-
-
-def _read_camera_info(content: dict[str, Any], path: Path, name: str | None) -> RigParts:
-    """The lens of the images as recorded (K and D, not the rectified P), and the camera's frame."""
-    message = checked_model(_Message, {str(key).lower(): v for key, v in content.items()}, path)
-    stated = lens_of(SimpleNamespace(**dict(message)), str(path), rectified=False)
-    camera = name or path.stem
-    return RigParts(
-        path, {camera: stated.lens}, frame_ids={camera: stated.frame} if stated.frame else {}
-    )
 
 
 def _part_of_rig(path: Path) -> RigParts:
