@@ -24,7 +24,7 @@ from calibgraph.model.result_files import (
     is_calibration_file,
 )
 from calibgraph.model.rig import Finite, Rig, rigid_transform
-from calibgraph.model.verdict import Check, ErrorProbability, Status, Verdict
+from calibgraph.model.verdict import Status, Verdict
 
 Table = TypeVar("Table")
 
@@ -54,14 +54,7 @@ def load_calibration(path: Path | str) -> Calibration:
     for key in _MEASURED:
         _require_possible(content.get(key), f"{path}: {key}")
     parts = checked_model(_Parts, content, path)
-    former = FORMER_SETTINGS.items()
-    settings = {key: value for key, value in parts.config.items() if (key, value) not in former}
     found = Calibration(
-        rig=checked_model(Rig, parts.rig, path),
-        initial_rig=checked_model(Rig, parts.initial_rig, path),
-        config=checked_model(Config, settings, path),
-        camera_verdicts=_verdicts(parts.camera_verdicts),
-        lidar_verdicts=_verdicts(parts.lidar_verdicts),
         lens_covariance={name: of.covariance for name, of in parts.lens_covariance.items()},
         frames=tuple(frame.model_dump(exclude_none=True) for frame in parts.frames_used),
         correspondences=_table(path, CORRESPONDENCES_FILE, content, load_correspondences),
@@ -140,28 +133,25 @@ class _JointOfLens(BaseModel):
     covariance: LensCovariance
 
 
-class _Checks(BaseModel):
-    status: Status
-    checks: tuple[Check, ...]
-    error_probability: ErrorProbability | None = None
-
-
-def _verdicts(parts: Mapping[str, _Checks]) -> dict[str, Verdict]:
-    return {name: Verdict(of.checks, of.error_probability) for name, of in parts.items()}
+def _without_former(settings: Any) -> Any:
+    """Settings without those of earlier versions that changed nothing."""
+    former = FORMER_SETTINGS.items()
+    is_map = isinstance(settings, dict)
+    return {k: v for k, v in settings.items() if (k, v) not in former} if is_map else settings
 
 
 class _Parts(BaseModel):
     """The keys of a result's file that are read, with their types; the others repeat them."""
 
-    rig: dict[str, Any]
-    initial_rig: dict[str, Any]
-    config: dict[str, Any]
+    rig: Rig
+    initial_rig: Rig
+    config: Annotated[Config, BeforeValidator(_without_former)]
     covariance: dict[str, Covariance | None]
     joint_covariance: JointCovariance | None
     pair_covariance: dict[str, Covariance]
     stage1_T_camera_lidar: dict[str, Matrix4]
-    camera_verdicts: dict[str, _Checks]
-    lidar_verdicts: dict[str, _Checks] = {}
+    camera_verdicts: dict[str, Verdict]
+    lidar_verdicts: dict[str, Verdict] = {}
     residuals: dict[str, Residuals]
     weaknesses: dict[str, tuple[str, ...]]
     frames_used: tuple[_FrameEntry, ...]
@@ -185,14 +175,13 @@ def _require_consistent(
     path: Path, content: Mapping[str, Any], parts: _Parts, found: Calibration
 ) -> None:
     """Check that the verdict follows from its checks, and all parts are of the same cameras."""
-    verdict = content.get("verdict", {})
-    status = verdict.get("status") if isinstance(verdict, dict) else verdict
-    verdicts = [("the rig", status, found.verdict.status)] + [
-        (f"{kind} {name!r}", each.status, found.verdicts[name].status)
-        for kind, of in (("camera", parts.camera_verdicts), ("LiDAR", parts.lidar_verdicts))
-        for name, each in of.items()
-    ]
-    for what, stated, derived in verdicts:
+    verdicts = [("the rig", content.get("verdict"), found.verdict)]
+    for kind, key in (("camera", "camera_verdicts"), ("LiDAR", "lidar_verdicts")):
+        of_kind = content.get(key, {}).items()
+        verdicts += [(f"{kind} {name!r}", each, found.verdicts[name]) for name, each in of_kind]
+    for what, written, verdict in verdicts:
+        stated = written.get("status") if isinstance(written, dict) else written
+        derived = verdict.status
         if stated != derived:
             raise FileError(
                 path,
@@ -203,10 +192,6 @@ def _require_consistent(
     right = {part: names == {*getattr(found, part)} for part in _OF_ALL_CAMERAS}
     right |= {part: names >= {*getattr(found, part)} for part in _OF_SOME_CAMERAS}
     right["counts"] &= all("used" in of_camera for of_camera in found.counts.values())
-    right["sigmas"] = all(
-        covariance is None or _is_whole(content.get("sigmas"), name)
-        for name, covariance in found.covariance.items()
-    )
     measured = {
         name for name, lidar in (found.rig.lidars or {}).items() if lidar.covariance is not None
     }
@@ -222,25 +207,11 @@ def _require_consistent(
         raise FileError(path, f"its {part} are not of the cameras of its rig; write it again")
 
 
-def _is_whole(sigmas: Any, camera: str) -> bool:
-    """Whether the sigmas of a file, which repeat the covariances, have three numbers each."""
-    found = sigmas.get(camera) if isinstance(sigmas, dict) else None
-    return isinstance(found, dict) and [len(each) for each in found.values()] == [3, 3]
-
-
 _OF_ALL_CAMERAS = ("covariance", "camera_verdicts", "counts")
 _OF_SOME_CAMERAS = (
     "residuals", "stage1_T_camera_lidar", "weaknesses", "prior_share", "error_sources", "lens",
 )  # fmt: skip
-_OTHERWISE = {
-    "rig",
-    "initial_rig",
-    "config",
-    "camera_verdicts",
-    "lidar_verdicts",
-    "lens_covariance",
-}
-_PLAIN = {f.name for f in fields(Calibration)} & _Parts.model_fields.keys() - _OTHERWISE
+_PLAIN = {f.name for f in fields(Calibration)} & _Parts.model_fields.keys() - {"lens_covariance"}
 """The parts that are those of a calibration as they are."""
 
 

@@ -28,9 +28,9 @@ from calibgraph.io.lenses import (
     stated_model,
     unified_coefficients,
 )
-from calibgraph.io.rig_parts import ONLY_CAMERA, RelativeCamera, RigParts, pose_of_quaternion
+from calibgraph.io.rig_parts import ONLY_CAMERA, RigParts, pose_of_quaternion, relative_pose
 from calibgraph.model.geometry import invert
-from calibgraph.model.rig import Intrinsics, Size, plain_key, rigid_transform
+from calibgraph.model.rig import Intrinsics, RelativePose, Size, plain_key, rigid_transform
 from calibgraph.yaml_text import describe_value, parse_yaml
 from factors import LensModel
 from factors.lens import COEFFICIENTS
@@ -89,7 +89,7 @@ def read_foreign(content: dict[str, Any], path: Path, name: str | None) -> RigPa
     owner = (name or cameras[0].name or path.stem) if single else name or ONLY_CAMERA
     lenses: dict[str, CameraLens] = {}
     extrinsics: dict[str, Array] = {}
-    pairs: list[RelativeCamera] = []
+    pairs: list[RelativePose] = []
     notes: list[str] = []
     for each in maps:
         camera = owner if single or not each.holds_a_lens else each.name or path.stem
@@ -101,7 +101,7 @@ def read_foreign(content: dict[str, Any], path: Path, name: str | None) -> RigPa
             notes += [note] if note else []
         for row, T in each.transforms():
             if row.start == "camera before":
-                pairs += [RelativeCamera(camera, before, T)] * bool(before)
+                pairs += [relative_pose(camera, before, T)] * bool(before)
             else:
                 found = T if row.end == "camera" else invert(T)
                 if np.abs(extrinsics.setdefault(camera, found) - found).max() > _SAME:

@@ -25,7 +25,6 @@ from calibgraph.io.rig_parts import (
     ONLY_CAMERA,
     Link,
     Links,
-    RelativeCamera,
     RigParts,
     T_between,
     ancestors,
@@ -324,10 +323,7 @@ def _part_of_rig(path: Path) -> RigParts:
             for name, c in cameras
         },
         T_camera_lidar=rig.T_camera_lidar,
-        relative_poses=tuple(
-            RelativeCamera(p.a, p.b, p.T_a_b, p.rotation_sigma_rad, p.translation_sigma_m)
-            for p in rig.relative_poses
-        ),
+        relative_poses=rig.relative_poses,
         frame_ids={name: each.frame_id for name, each in cameras if each.frame_id},
         mounts={name: each.mount for name, each in cameras if each.mount},
         lidar=rig.lidar,
