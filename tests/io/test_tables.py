@@ -135,15 +135,6 @@ def test_a_file_that_is_not_there_or_not_whole_is_named(
         load(tmp_path / ("x" * 300 + ".parquet"))
 
 
-def test_a_whole_number_is_a_systematic_error_as_well(tmp_path: Path) -> None:
-    said = {"systematic_rotation_rad": 1, "systematic_translation_m": 0.02}
-    table(metadata=said).save(tmp_path / "table.parquet")
-    assert load_correspondences(tmp_path / "table.parquet").findings.systematic_sigmas == (
-        1.0,
-        0.02,
-    )
-
-
 def changed(name: str, column: pa.Array | pa.ChunkedArray, **metadata: str | bytes) -> pa.Table:
     """A good Arrow table with one column, or its metadata, replaced."""
     arrow = GOOD.set_column(GOOD.column_names.index(name), name, column)
@@ -168,10 +159,6 @@ CAMERAS = pa.array([0, 1, 0, 2])
             changed("camera", pa.DictionaryArray.from_arrays(CAMERAS, ["a", None, "b"])),
             "row 1: column 'camera' is empty",
         ),
-        (
-            changed("camera", pa.DictionaryArray.from_arrays(CAMERAS, FOUR)),
-            "'camera' must hold text, found dictionary<values=double",
-        ),
         (changed("camera", pa.array([b"\xff"] * 4)), "has the wrong type: Invalid UTF8"),
         (changed("frame", pa.array([2**63] * 4, pa.uint64())), "'frame' .* beyond 64 bits"),
         (changed("frame", pa.array(FOUR)), "'frame' must hold whole numbers, found double"),
@@ -180,13 +167,6 @@ CAMERAS = pa.array([0, 1, 0, 2])
             changed("u_px", pa.RunEndEncodedArray.from_arrays([4], [1.0])),
             "'u_px' must hold numbers, found run_end_encoded",
         ),
-        (changed("u_px", pa.array([FOUR] * 4)), "'u_px' must hold numbers, found list"),
-        (
-            changed("u_px", pa.array(FOUR).dictionary_encode()),
-            "'u_px' must hold numbers, found dictionary",
-        ),
-        (changed("u_px", pa.array([1] * 4, pa.decimal128(3, 1))), "found decimal"),
-        (changed("u_px", pa.array([1] * 4, pa.timestamp("s"))), "found timestamp"),
         (
             changed("u_px", pa.array(FOUR), matcher='{"systematic_rotation_rad": -1}'),
             "systematic_rotation_rad: .* greater than or equal to 0, found -1",
@@ -209,7 +189,6 @@ def test_wrong_arrow_data_is_named_in_one_line(arrow: pa.Table, message: str) ->
         pa.array(["left", "left", "right", "left"]).dictionary_encode(),
         pa.array(["left", "left", "right", "left"], pa.large_string()),
         pa.array([b"left", b"left", b"right", b"left"]),
-        pa.chunked_array([pa.array(["left", "left"]), pa.array(["right", "left"])]),
         pa.DictionaryArray.from_arrays([0, 1, 3, 0], ["left", "left", None, "right"]),
     ],
 )

@@ -273,11 +273,11 @@ def test_the_baseline_in_P_is_added_where_the_frame_lies_at_that_of_the_first(
         assert [each.frame_id for each in rig.cameras.values()] == ["stereo", None]
 
 
-@pytest.mark.parametrize("shift", [(-0.12, 0.0, 0.0), (0.0, 0.2, 0.0), (0.3, -0.1, 0.02)])
 @pytest.mark.parametrize("image", ["image_rect", "image_raw"])
 def test_a_baseline_along_any_axis_parts_the_cameras_as_recorded_and_rectified(
-    tmp_path: Path, shift: tuple[float, float, float], image: str
+    tmp_path: Path, image: str
 ) -> None:
+    shift = (0.3, -0.1, 0.02)
     bag = pair(tmp_path, ("stereo", "stereo"), SHARED, shift=shift, R=np.eye(3), image=image)
     T = load_rig(bag).T_camera_lidar
     expected = np.eye(4)

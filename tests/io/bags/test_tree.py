@@ -295,14 +295,6 @@ def test_an_export_names_the_frames_of_the_bag(result: Path, tmp_path: Path, for
     assert "velodyne" in text
     assert all(frame in text for frame in IDS.values())
     assert "left_optical_frame" not in text
-    export_calibration(
-        result, path, format, camera_frame="cam/{camera}", lidar_frame="top", even_if_failed=True,
-        force=True,
-    )  # fmt: skip
-    chosen = path.read_text()
-    assert "cam/left" in chosen
-    assert "velodyne" not in chosen
-    assert "left_optical" not in chosen
 
 
 EDGES = {child: (parent, T) for parent, child, T in tree_of(load_rig(SAMPLE))}
