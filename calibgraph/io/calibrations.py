@@ -5,12 +5,11 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
-import numpy as np
 from pydantic import AfterValidator, AliasPath, BaseModel, BeforeValidator, Field, StrictBool
 
 from calibgraph.arrays import Array
 from calibgraph.errors import FileError
-from calibgraph.files import checked_model, holds_truth_value, load_model, read_yaml, sha256
+from calibgraph.files import checked_model, load_model, read_yaml, sha256
 from calibgraph.io.tables import load_camera_matches, load_correspondences
 from calibgraph.model.calibration import Calibration, Residuals
 from calibgraph.model.config import FORMER_SETTINGS, Config, Reported, Terms
@@ -23,18 +22,22 @@ from calibgraph.model.result_files import (
     CORRESPONDENCES_FILE,
     is_calibration_file,
 )
-from calibgraph.model.rig import Finite, Rig, rigid_transform
+from calibgraph.model.rig import (
+    LARGEST_VARIANCE,
+    Finite,
+    Rig,
+    covariance_matrix,
+    rigid_transform,
+)
 from calibgraph.model.verdict import Status, Verdict
 
 Table = TypeVar("Table")
 
 _POSE = 6  # numbers of one
-_LARGEST = 1e24  # of a covariance: that of a pose that nothing determines is smaller
 _MEASURED = (
     "timings_s", "residuals", "rounds", "prior_share", "error_sources", "lens", "covariance",
     "joint_covariance", "pair_covariance", "lens_covariance", "sigmas",
 )  # fmt: skip
-_ROUNDING = 1e-6  # of correlations: other programs may write fewer digits
 
 
 def load_calibration(path: Path | str) -> Calibration:
@@ -70,30 +73,10 @@ def _require_possible(value: Any, where: str) -> None:
     if isinstance(value, (dict, list)):
         for key, each in value.items() if isinstance(value, dict) else enumerate(value):
             _require_possible(each, f"{where}.{key}")
-    elif isinstance(value, float) and not abs(value) <= _LARGEST:
+    elif isinstance(value, float) and not abs(value) <= LARGEST_VARIANCE:
         raise FileError(
             where, f"is {value}, no number of a result; the file was edited, write it again"
         )
-
-
-def _covariance(value: Any) -> Array:
-    """A covariance: a square matrix of finite numbers, symmetric, and of no negative variance."""
-    try:
-        found = np.array(value, np.float64)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise ValueError("expected a matrix of numbers") from error
-    if holds_truth_value(value):
-        raise ValueError("expected a matrix of numbers, found a truth value in it")
-    if found.ndim != 2 or len({*found.shape}) != 1 or not (np.abs(found) <= _LARGEST).all():  # noqa: PLR2004
-        raise ValueError(f"expected a square matrix of finite numbers, found {found.shape}")
-    variances = np.diag(found)
-    units = np.sqrt(np.where(variances > 0, variances, 1.0))
-    correlations = found / np.outer(units, units)
-    if not np.allclose(correlations, correlations.T, atol=_ROUNDING):
-        raise ValueError("it is not symmetric; the file was edited, write it again")
-    if (variances < 0).any() or np.linalg.eigvalsh(correlations)[0] < -_ROUNDING * len(found):
-        raise ValueError("it has negative variances; the file was edited, write it again")
-    return found
 
 
 def _of_poses(found: Array) -> Array:
@@ -108,8 +91,7 @@ def _of_one_pose(found: Array) -> Array:
     return found
 
 
-Matrix4 = Annotated[Any, BeforeValidator(rigid_transform)]
-LensCovariance = Annotated[Any, BeforeValidator(_covariance)]
+LensCovariance = Annotated[Any, BeforeValidator(covariance_matrix)]
 JointCovariance = Annotated[LensCovariance, AfterValidator(_of_poses)]
 Covariance = Annotated[LensCovariance, AfterValidator(_of_one_pose)]
 
@@ -149,7 +131,7 @@ class _Parts(BaseModel):
     covariance: dict[str, Covariance | None]
     joint_covariance: JointCovariance | None
     pair_covariance: dict[str, Covariance]
-    stage1_T_camera_lidar: dict[str, Matrix4]
+    stage1_T_camera_lidar: dict[str, Annotated[Any, BeforeValidator(rigid_transform)]]
     camera_verdicts: dict[str, Verdict]
     lidar_verdicts: dict[str, Verdict] = {}
     residuals: dict[str, Residuals]

@@ -158,11 +158,6 @@ class Frame:
         return None if self.find_motion is None else self.find_motion()
 
     @property
-    def is_corrected(self) -> bool:
-        """Whether its cloud is corrected for motion."""
-        return self.find_motion is not None
-
-    @property
     def twist_per_s(self) -> Array | None:
         """(6,) of the LiDAR: rotation [rad/s], translation [m/s]; None if it is unknown."""
         if self.twist is not None:

@@ -43,7 +43,8 @@ def load_correspondences(path: Path | str) -> Correspondences:
     """
     path = require_file(Path(path))
     table = read_arrow(path)
-    require_rows(path, len(table))
+    if not len(table):
+        raise FileError(path, "holds no rows; write the correspondences into it")
     try:
         return from_arrow(table)
     except CorrespondenceError as error:
@@ -116,12 +117,6 @@ def arrow_reads(path: Path) -> Iterator[None]:
         kind = {".csv": "CSV", ".feather": "Feather"}.get(path.suffix.lower(), "Parquet")
         message = f"cannot be read as {kind} ({error}); is it complete? write it again"
         raise FileError(path, message) from error
-
-
-def require_rows(path: Path, rows: int) -> None:
-    """Check that a file has rows."""
-    if not rows:
-        raise FileError(path, "holds no rows; write the correspondences into it")
 
 
 def from_arrow(table: pa.Table) -> Correspondences:

@@ -184,14 +184,9 @@ def no_place_for(name: str, camera: Camera, what: str) -> CalibrationError:
     )
 
 
-def commented(lines: Iterable[str]) -> str:
-    """Lines as a comment of YAML and of shells."""
-    return "".join(f"# {line}\n" for line in lines)
-
-
 def commented_yaml(statement: Iterable[str], content: dict[str, Any]) -> str:
     """YAML below its statement of direction."""
-    return commented(statement) + yaml_text(content)
+    return "".join(f"# {line}\n" for line in statement) + yaml_text(content)
 
 
 def commented_xml(statement: Iterable[str], root: ElementTree.Element) -> str:

@@ -115,11 +115,6 @@ class _Stamped(Foreign):
     qw: float = Field(validation_alias=AliasPath("transform", "rotation", "w"))
 
 
-def is_tf2(content: dict[str, Any]) -> bool:
-    """Whether the content of a YAML file is a TFMessage, or a single TransformStamped."""
-    return "transforms" in content or {"transform", "child_frame_id"} <= content.keys()
-
-
 def read_tf2(documents: list[dict[str, Any]], path: Path) -> RigParts:
     """The frames of TFMessages and TransformStampeds; the last of several for a child.
 
@@ -153,11 +148,6 @@ class _Pose(Foreign):
     roll: Finite
     pitch: Finite
     yaw: Finite
-
-
-def is_autoware(content: dict[str, Any]) -> bool:
-    """Whether the content of a YAML file is parent: {child: {x, y, z, roll, pitch, yaw}}."""
-    return any(isinstance(pose, dict) and "roll" in pose for _, _, pose in _entries(content))
 
 
 def _entries(content: dict[str, Any]) -> Iterator[tuple[str, str, Any]]:
@@ -260,8 +250,11 @@ def read_part(path: Path, name: str | None) -> RigParts:  # noqa: PLR0911 - a li
         return _read_xml(path)
     if suffix in (".sh", ".bash"):
         return read_publishers(read_text(path).splitlines(), path)
-    if suffix in (".yaml", ".yml", ".json"):
-        return _read_content(_read_documents(path), path, name)
+    if suffix == ".json":
+        return _read_content([read_json(path)], path, name)
+    if suffix in (".yaml", ".yml"):  # several documents are what `ros2 topic echo` prints
+        text = re.sub(r"\A%YAML.*\n", "", read_text(path))
+        return _read_content(parse_yaml_documents(text, path), path, name)
     with path.open("rb") as file:
         head = file.read(_HEAD_BYTES).decode("utf-8", "replace")
     raise FileError(path, _unknown(f"a file {suffix or 'without a suffix'} is", head))
@@ -283,22 +276,15 @@ def _unknown(what: str, text: str = "") -> str:
     )
 
 
-def _read_documents(path: Path) -> list[dict[str, Any]]:
-    """The mappings of a file: several of a YAML file, as ``ros2 topic echo`` prints them."""
-    if path.suffix.lower() == ".json":
-        return [read_json(path)]
-    return parse_yaml_documents(re.sub(r"\A%YAML.*\n", "", read_text(path)), path)
-
-
 def _read_content(documents: list[dict[str, Any]], path: Path, name: str | None) -> RigParts:
     content = documents[0]
-    if is_tf2(content):
+    if "transforms" in content or {"transform", "child_frame_id"} <= content.keys():
         return read_tf2(documents, path)
     if len(documents) > 1:
         raise FileError(path, f"holds {len(documents)} YAML documents; keep one of them")
     if "format" in content or is_exported_rig(content):
         return _part_of_rig(path)
-    if is_autoware(content):
+    if any(isinstance(pose, dict) and "roll" in pose for _, _, pose in _entries(content)):
         return read_autoware(content, path)
     found = read_foreign(content, path, name)
     if found is None:
