@@ -281,6 +281,22 @@ class Frame:
         return files
 
 
+def frames_by_stem(
+    clouds: Mapping[str, Path],
+    images: Mapping[str, Mapping[str, Path]],
+    lidars: Mapping[str, Mapping[str, Path]] | None = None,
+) -> list[Frame]:
+    """A frame per cloud, with the images and the clouds of other LiDARs that have its stem."""
+
+    def having(stem: str, files: Mapping[str, Mapping[str, Path]]) -> dict[str, Path]:
+        return {name: of[stem] for name, of in files.items() if stem in of}
+
+    return [
+        Frame(n, stem, cloud, having(stem, images), lidar_paths=having(stem, lidars or {}))
+        for n, (stem, cloud) in enumerate(clouds.items())
+    ]
+
+
 class ScanSteps:
     """Steps between frames by registration: each scan is prepared once, each pair fitted once."""
 

@@ -162,7 +162,7 @@ def test_of_a_deployed_kit_only_calibrated_rows_change(
     words = ["export", folder, "--format", "autoware", "--out", kit, "--deployed", kit, "--force"]
     for deployed, named in (
         ({"sensor_kit_base_link": rows}, "kit.yaml: has no row left, only front, imu, top: name"),
-        ({"sensor_kit_base_link": {"top": {"x": 1}}}, "kit_base_link: top: key 'y' is missing"),
+        ({"sensor_kit_base_link": {"top": {"x": 1}}}, "kit_base_link: top: expected the keys x, y"),
         ({"base_link": rows}, "kit.yaml: has no rows of sensor_kit_base_link; name the"),
     ):
         kit.write_text(yaml.safe_dump(deployed))

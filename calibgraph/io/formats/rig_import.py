@@ -11,14 +11,14 @@ from xml.etree import ElementTree
 import numpy as np
 from defusedxml import DefusedXmlException
 from defusedxml.ElementTree import fromstring
-from pydantic import AliasPath, ConfigDict, Field
+from pydantic import AliasPath, Field
 
 from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError, FileError
 from calibgraph.files import checked_model, read_json, read_text, require_file
 from calibgraph.io.bags import is_bag
 from calibgraph.io.bags.rig import read_bag_rig
-from calibgraph.io.formats.foreign_keys import Foreign, read_foreign
+from calibgraph.io.formats.foreign_keys import Foreign, numbers, read_foreign
 from calibgraph.io.kitti import CALIBRATION_NAME
 from calibgraph.io.lenses import CameraLens
 from calibgraph.io.rig_parts import (
@@ -37,8 +37,8 @@ from calibgraph.io.rig_parts import (
 )
 from calibgraph.io.rigs import is_exported_rig, read_rig
 from calibgraph.model.geometry import T_OPTICAL_LINK
-from calibgraph.model.rig import KNOWLEDGE, Finite, Mount, Rig
-from calibgraph.yaml_text import parse_yaml_documents
+from calibgraph.model.rig import KNOWLEDGE, Mount, Rig
+from calibgraph.yaml_text import describe_value, parse_yaml_documents
 
 _PUBLISHER = "static_transform_publisher"
 _NAMES = ("x", "y", "z", "qx", "qy", "qz", "qw")
@@ -139,17 +139,6 @@ def read_tf2(documents: list[dict[str, Any]], path: Path) -> RigParts:
     return RigParts(path, links=tuple(links.values()), notes=tuple(notes))
 
 
-class _Pose(Foreign):
-    model_config = ConfigDict(extra="forbid")
-
-    x: Finite
-    y: Finite
-    z: Finite
-    roll: Finite
-    pitch: Finite
-    yaw: Finite
-
-
 def _entries(content: dict[str, Any]) -> Iterator[tuple[str, str, Any]]:
     for parent, children in content.items():
         for child, pose in children.items() if isinstance(children, dict) else ():
@@ -160,9 +149,13 @@ def read_autoware(content: dict[str, Any], path: Path) -> RigParts:
     """The frames of a sensor kit."""
     links = []
     for parent, child, pose in _entries(content):
-        p = checked_model(_Pose, pose, f"{path}: {parent}: {child}")
+        where = f"{path}: {parent}: {child}"
+        if not isinstance(pose, dict) or pose.keys() != {*_ANGLES}:
+            keys = ", ".join(_ANGLES)
+            raise FileError(where, f"expected the keys {keys}, found {describe_value(pose)}")
         try:
-            T = pose_of_angles((p.x, p.y, p.z), (p.roll, p.pitch, p.yaw))
+            values = [numbers(pose[key], f"{where}: {key}").item() for key in _ANGLES]
+            T = pose_of_angles(values[:3], values[3:])
         except ValueError as error:
             raise FileError(path, f"{parent}: {child}: {error}") from error
         links.append(Link(parent, child, T))
