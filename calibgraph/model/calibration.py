@@ -296,10 +296,6 @@ class Calibration:
         rows = joint_parameters(self.lens[name])
         return {"parameters": rows, "covariance": self.lens_covariance[name].tolist()}
 
-    def with_inputs(self, inputs: Mapping[str, str]) -> Calibration:
-        """The same result with the SHA-256 of its input files, by path."""
-        return replace(self, inputs=dict(inputs))
-
     def save(self, folder: Path | str) -> Path:
         """Write ``calibration.yaml``, and tables of the matches if there are any, into a folder.
 
