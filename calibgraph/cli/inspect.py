@@ -22,40 +22,24 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-_PAGES = (".html", ".htm")
-
-
 def report(
     result: Path = Argument(..., metavar="RESULT", help="Its folder, or its calibration.yaml."),
     out: Path | None = Option(
-        None, metavar="FILE.html", help="Page. (default: report.html beside, or none with --mcap)"
+        None, metavar="FILE.html", help="Page. (default: report.html beside the result)"
     ),
-    mcap: Path | None = Option(None, metavar="FILE.mcap", help="Recording for Foxglove or Rerun."),
     force: options.Force = False,
 ) -> None:
-    """Show a result: as one HTML page that opens without a network, or as a recording.
-
-    The recording shows clouds, images and projected points, before and after.
-    """
+    """Show a result as one HTML page that opens without a network."""
     from calibgraph.files import require_new_file
     from calibgraph.io.calibrations import load_calibration
     from calibgraph.model.result_files import REPORT_FILE
     from calibgraph.report.html import write_report
 
-    for path, suffixes in ((out, _PAGES), (mcap, (".mcap",))):
-        if path is not None:
-            require_new_file(path, *suffixes, force=force)
-    loaded, written = load_calibration(result), []
-    if out is not None or mcap is None:
-        folder = result if result.is_dir() else result.parent
-        written.append(write_report(loaded, out or folder / REPORT_FILE))
-    if mcap is not None:
-        from calibgraph.report.mcap_file import write_mcap
-
-        with progress_bar("reading") as progress:
-            written.append(write_mcap(loaded, mcap, progress=progress))
-    for path in written:
-        print_line(f"{path}: written; the verdict is {loaded.verdict.status}")
+    if out is not None:
+        require_new_file(out, ".html", ".htm", force=force)
+    loaded, folder = load_calibration(result), result if result.is_dir() else result.parent
+    path = write_report(loaded, out or folder / REPORT_FILE)
+    print_line(f"{path}: written; the verdict is {loaded.verdict.status}")
 
 
 def evaluate(

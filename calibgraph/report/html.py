@@ -28,7 +28,6 @@ from calibgraph.model.result_files import (
 )
 from calibgraph.model.rig import Camera
 from calibgraph.model.verdict import Check, Direction, beside, in_unit, is_reachable
-from calibgraph.report import plots
 from calibgraph.report.kit import page_template
 from calibgraph.report.page_overlays import (
     depth_scale,
@@ -36,7 +35,7 @@ from calibgraph.report.page_overlays import (
     width_on_page,
     write_overlays,
 )
-from calibgraph.report.plots import ReprojectionErrors, reprojection_errors
+from calibgraph.report.plots import ReprojectionErrors, reprojection_errors, residual_map
 from calibgraph.solver.pairs import match_errors_px
 
 
@@ -74,7 +73,7 @@ def render_page(result: Calibration) -> str:
             "moved": pose_error(camera.T_camera_lidar, guess.T_camera_lidar[name]),
             "sigmas": result.error_bar(name),
             "overlays": overlays.get(name),
-            "diagrams": camera_diagrams(result, name, errors.get(name)),
+            "residuals": residual_map(camera, errors[name]) if name in errors else None,
             "worked": worked_point(camera, errors.get(name)),
             "rounds": [cameras[name] for cameras in result.rounds if name in cameras],
         }
@@ -246,15 +245,6 @@ def pose_text(T: Array) -> str:
         f"translation x y z   = {' '.join(f'{v:.6f}' for v in T[:3, 3])} m\n"
         f"quaternion  x y z w = {x:.6f} {y:.6f} {z:.6f} {w:.6f}"
     )
-
-
-def camera_diagrams(
-    result: Calibration, name: str, errors: ReprojectionErrors | None
-) -> dict[str, str]:
-    """Residuals over the image, and its coverage, as data URIs by name."""
-    camera = result.rig.cameras[name]
-    drawn = {"over_image": plots.residual_map, "coverage": plots.coverage}
-    return {} if errors is None else {key: draw(camera, errors) for key, draw in drawn.items()}
 
 
 def recording_name(result: Calibration) -> str:

@@ -28,8 +28,6 @@ from tests.conftest import CommandRun
 from tests.report.browsing import render
 from tests.report.conftest import read_page, solve_simulated, write_page
 
-pytestmark = pytest.mark.usefixtures("blank_diagrams")
-
 
 def title_of(text: str) -> str:
     match = re.search("<title>(.*?)</title>", text)
