@@ -60,8 +60,7 @@ def test_a_form_that_is_no_job_is_refused_in_one_line(
 def test_only_printable_characters_of_names_are_kept(make_server: Make, small: Problem) -> None:
     client = make_server()
     evil = "car\x1b[2J \x7f7\x9b \u202eevil\u2066\r\n<b>"
-    answer = submit(client, small, name=evil, note=f"{evil}\x00").json()
-    assert (answer["name"], answer["note"]) == ("car[2J 7 evil <b>", "car[2J 7 evil <b>")
+    assert submit(client, small, name=evil).json()["name"] == "car[2J 7 evil <b>"
     page = client.get("/").text
     assert "car[2J 7 evil &lt;b&gt;" in page and "<b>\n" not in page
 
