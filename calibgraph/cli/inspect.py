@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from shlex import join
@@ -158,20 +157,7 @@ def weights(
         print_weights(terminal(), checkpoint.summary(), out)
 
 
-_LIST = "list"
-
-
-def _list_formats(format: str) -> str:
-    """Print the formats for ``--format list``, before other arguments are required."""
-    if format == _LIST:
-        from calibgraph.report.as_json import print_line
-
-        width = max(map(len, EXPORT_FORMATS))
-        lines = (f"{name:{width}}  {meaning}" for name, meaning in EXPORT_FORMATS.items())
-        with suppress(BrokenPipeError):
-            print_line("\n".join(lines))
-        raise typer.Exit
-    return format
+_FORMATS = "; ".join(f"{name}: {meaning}" for name, meaning in EXPORT_FORMATS.items()) + "."
 
 
 def export(
@@ -181,9 +167,7 @@ def export(
     format: str = Option(
         ...,
         metavar="FORMAT",
-        callback=_list_formats,
-        is_eager=True,
-        help=f"{', '.join(EXPORT_FORMATS)}; list: what these are.",
+        help=_FORMATS,
     ),
     out: Path = Option(..., metavar="FILE", help="File to write; of camera_info a folder."),
     camera: list[str] | None = Option(

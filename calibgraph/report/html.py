@@ -15,7 +15,7 @@ from calibgraph.io.dataset import Dataset
 from calibgraph.io.formats import EXPORT_FORMATS
 from calibgraph.io.frame import frame_of_entry
 from calibgraph.model.calibration import FRAMES_SENTENCE, TANGENT_SENTENCE, Calibration
-from calibgraph.model.geometry import degrees_and_centimetres, invert, point_in_lidar
+from calibgraph.model.geometry import degrees_and_centimetres, invert
 from calibgraph.model.metrics import pose_error
 from calibgraph.model.places import describe_places
 from calibgraph.model.result_files import (
@@ -26,7 +26,6 @@ from calibgraph.model.result_files import (
     TABLES,
     require_own_tables,
 )
-from calibgraph.model.rig import Camera
 from calibgraph.model.verdict import Check, Direction, beside, in_unit, is_reachable
 from calibgraph.report.kit import page_template
 from calibgraph.report.page_overlays import (
@@ -35,7 +34,7 @@ from calibgraph.report.page_overlays import (
     width_on_page,
     write_overlays,
 )
-from calibgraph.report.plots import ReprojectionErrors, reprojection_errors, residual_map
+from calibgraph.report.plots import reprojection_errors, residual_map
 from calibgraph.solver.pairs import match_errors_px
 
 
@@ -74,7 +73,6 @@ def render_page(result: Calibration) -> str:
             "sigmas": result.error_bar(name),
             "overlays": overlays.get(name),
             "residuals": residual_map(camera, errors[name]) if name in errors else None,
-            "worked": worked_point(camera, errors.get(name)),
             "rounds": [cameras[name] for cameras in result.rounds if name in cameras],
         }
         for index, (name, camera) in enumerate(rig.cameras.items())
@@ -199,38 +197,6 @@ def check_cells(check: Check) -> tuple[str, str, str]:
     )
     found = beside(check.value, check.fail if check.status == "FAIL" else check.warn, check.unit)
     return found, warn, fail
-
-
-_DISTANCE_M = 10.0
-
-
-def worked_point(camera: Camera, errors: ReprojectionErrors | None) -> str:
-    """Project the used correspondence nearest to 10 m, or a point on the optical axis, in lines."""
-    T = camera.T_camera_lidar
-    used = None if errors is None else errors.select(errors.is_inlier)
-    if used is None or not len(used.frame):
-        point, matched = point_in_lidar(T, np.array([0.0, 0.0, _DISTANCE_M])), ""
-    else:
-        row = int(np.argmin(np.abs(used.distances_m - _DISTANCE_M)))
-        point, (u, v) = used.points_lidar_m[row], used.pixels_px[row]
-        matched = (
-            f"\nmatched pixel            = ({u:.2f}, {v:.2f}) px in frame {used.frame[row]}, "
-            f"residual {used.sizes_px[row]:.2f} px"
-        )
-    p_camera, k = T[:3, :3] @ point + T[:3, 3], camera.intrinsics_px
-    u, v = camera.lens.project(p_camera[None])[0][0]
-    distortion = ", ".join(f"{each:g}" for each in camera.distortion) or "none"
-    return (
-        f"p_lidar                  = {_vector(point)} m\n"
-        f"p_camera = R p_lidar + t = {_vector(p_camera)} m\n"
-        f"lens                     = {camera.model}, fx {k.fx:.3f}, fy {k.fy:.3f}, "
-        f"cx {k.cx:.3f}, cy {k.cy:.3f}; distortion {distortion}\n"
-        f"projected pixel (u, v)   = ({u:.2f}, {v:.2f}) px{matched}"
-    )
-
-
-def _vector(values: Array) -> str:
-    return f"({', '.join(f'{value:.3f}' for value in values)})"
 
 
 def matrix_text(T: Array) -> str:

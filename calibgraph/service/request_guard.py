@@ -15,7 +15,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from calibgraph.errors import FileError
 from calibgraph.files import read_text, write_text
-from calibgraph.service.problems import Problem, problem_response
+from calibgraph.service.problems import Problem
 from calibgraph.service.requests import Settings
 
 Tokens = frozenset[str]
@@ -86,7 +86,7 @@ class RequestGuard:
             self._require_ours(scope, body.most_bytes)
             await self._app(scope, body.receive, send_with_headers)
         except Problem as problem:
-            await problem_response(problem)(scope, receive, send_with_headers)
+            await problem.response(scope, receive, send_with_headers)
         finally:
             if rest is not None:
                 rest.cancel()
