@@ -107,15 +107,6 @@ def test_of_several_rows_of_a_camera_the_newest_counts() -> None:
     assert newest_rows(both).sort_by("vehicle")["date"].to_pylist() == rows["date"].to_pylist()
 
 
-@pytest.mark.statistics
-@pytest.mark.parametrize("seed", range(10))
-def test_error_bars_hold_over_many_fleets(seed: int) -> None:
-    truth: Fleet = simulate_fleet(np.random.default_rng(seed), 500)
-    fitted = Fitted(truth, fit_fleet(observe(truth.rows)))
-    for chosen in (truth.poor, ~truth.poor):
-        assert 0.8 < nees(fitted)[chosen].mean() < 1.25
-
-
 def displaced(rows: pa.Table, chosen: np.ndarray, twists: np.ndarray) -> pa.Table:
     """The rows with some cameras moved in the LiDAR's axes: T exp(twist)."""
     T = observe(rows).T_camera_lidar

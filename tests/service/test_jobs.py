@@ -139,16 +139,6 @@ def test_old_results_expire(make_server: Make, small: Problem) -> None:
     assert [path.name for path in (service_folder(client) / "jobs").iterdir()] == [later]
 
 
-def test_a_result_that_expires_meanwhile_is_not_there(
-    working: TestClient, solved: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    app: Any = working.app
-    monkeypatch.setattr(app.state.service.folder, "jobs", tmp_path)
-    for part in ("result", "report.html", "files.zip"):
-        assert working.get(f"/v1/jobs/{solved}/{part}").status_code == 404
-    assert working.get(f"/v1/jobs/{solved}/log").text == ""
-
-
 def zip_of_the_sample(*stems: str) -> bytes:
     """The sample without its truth; of these stems alone, if any."""
     files = [path for path in sorted(SAMPLE.rglob("*")) if path.is_file()]
