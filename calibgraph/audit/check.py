@@ -7,16 +7,16 @@ from pathlib import Path
 
 import numpy as np
 from scipy.linalg import block_diag
-from scipy.special import ndtri
 
 from calibgraph.arrays import Array
 from calibgraph.audit.judgement import (
+    FALSE_ALARM_RATE,
     SEARCHES_FARTHER,
+    Limits,
     deviation_of,
     find_lidar_motion,
     has_too_few_frames,
     judge_camera,
-    tail_of_axis,
     tolerance_twist,
 )
 from calibgraph.audit.lidars import MeasuredLidars, measure_lidars
@@ -145,7 +145,7 @@ def check(
         cameras = dict.fromkeys(deployed.cameras, nothing)
     finally:
         full.release()
-    lidar = _judge_lidar(evidence, cameras, lidars)
+    lidar = _judge_lidar(evidence, cameras, lidars, tolerance)
     middle = data.frames[len(data.frames) // 2].with_burnt_in({})  # as it was recorded
     sources = tuple(map(str, data.folders))
     return Audit(
@@ -182,7 +182,10 @@ def _judge(
 
 
 def _judge_lidar(
-    evidence: Evidence | None, cameras: Mapping[str, CameraAudit], lidars: MeasuredLidars | None
+    evidence: Evidence | None,
+    cameras: Mapping[str, CameraAudit],
+    lidars: MeasuredLidars | None,
+    tolerance: Array,
 ) -> LidarAudit | None:
     """The motion of the LiDAR, of several the base, if one explains the deviations of all others.
 
@@ -209,7 +212,7 @@ def _judge_lidar(
         np.asarray(block_diag(*covariances)),
         poses,
         moved=[k for k, each in enumerate(audits.values()) if each.status == "WRONG"],
-        quantile=float(ndtri(1 - tail_of_axis(len(audits)))),
+        quantile=Limits.of(np.inf, FALSE_ALARM_RATE / len(audits), tolerance).axis[0],
     )
 
 
