@@ -154,8 +154,8 @@ class Sums:
         moved = (self.hessian @ steps[..., None])[..., 0]
         return self.change(gradient=self.gradient + moved)
 
-    def after_walk(self, variance: Array, overconfidence: Array) -> tuple[Sums, Array]:
-        """The sums after a random walk, and (...) which share of them is left.
+    def after_walk(self, variance: Array, overconfidence: Array) -> Sums:
+        """The sums after a random walk.
 
         Args:
             variance: (..., 6) of the walk.
@@ -166,12 +166,11 @@ class Sums:
         hessian, back = gain @ hessian, gain.swapaxes(-1, -2)
         hessian = (hessian + hessian.swapaxes(-1, -2)) / 2
         kept = np.trace(gain, axis1=-2, axis2=-1) / _POSE
-        walked = (self * kept).change(
+        return (self * kept).change(
             hessian=hessian,
             gradient=(gain @ self.gradient[..., None])[..., 0],
             scatter=gain @ self.scatter @ back + hessian * variance[..., None, :] @ hessian,
         )
-        return walked, kept
 
     @property
     def are_determined(self) -> Mask:
