@@ -23,7 +23,8 @@ from calibgraph.tracking.state import STRENGTHS, State
 from calibgraph.tracking.sums import Numbers, Sums
 from factors import to_runs
 
-_GATE_STEPS = 4  # by the Hessian by weights, which descend: each leaves a third of the way
+_GATE_STEPS = 4  # by the Hessian by weights, which descend: each leaves a fifth of the way
+_SMALL_STEP = 1e-2  # squared sigmas of independent matches
 
 
 def close_epoch(state: State, graph: EpochGraph) -> list[Event]:
@@ -74,7 +75,10 @@ def _newest(state: State, graph: EpochGraph) -> Array:
         pull = np.array([sums.gradient for sums in found]) + older.gradient
         pull += (older.hessian @ steps)[..., 0]
         whole = np.array([sums.hessian for sums in found]) + older.hessian + WEAK
-        at = retract_all(at, np.asarray(-np.linalg.solve(whole, pull[..., None])[..., 0]))
+        step = np.asarray(-np.linalg.solve(whole, pull[..., None])[..., 0])
+        at = retract_all(at, step)
+        if (step * pull).sum(axis=1).min() > -_SMALL_STEP:
+            break
     newest[cameras] = at
     return newest
 
