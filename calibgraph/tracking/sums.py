@@ -165,7 +165,7 @@ class Sums:
         gain = np.linalg.inv(np.eye(_POSE) + hessian * by[..., None, :])
         hessian, back = gain @ hessian, gain.swapaxes(-1, -2)
         hessian = (hessian + hessian.swapaxes(-1, -2)) / 2
-        kept = np.trace(gain, axis1=-2, axis2=-1) / _POSE
+        kept = np.asarray(np.trace(gain, axis1=-2, axis2=-1) / _POSE)
         return (self * kept).change(
             hessian=hessian,
             gradient=(gain @ self.gradient[..., None])[..., 0],
