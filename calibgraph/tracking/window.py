@@ -15,7 +15,7 @@ import gtsam
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.graph.latent_poses import LatentPoseModel
+from calibgraph.graph.latent_poses import LatentPoseModel, to_ordering
 from calibgraph.graph.variables import CLOUD, DISTORTION, aligned_key, camera_key, matched_key
 from calibgraph.model.geometry import adjoints, to_T_lidar_camera
 
@@ -123,21 +123,7 @@ class Window:
 
     def undetermined(self) -> float:
         """Degrees of freedom of the shared errors that the data leave open."""
-        parts, cameras = self.model.components, len(self._poses)
-        seen = aligned_key if self.model.is_distorted else camera_key
-        keys = [*self._keys, *map(seen, range(cameras))]
-        own = self.covariance(keys)
-        found = float(np.trace(np.linalg.solve(parts.cloud, own[:_POSE, :_POSE])))
-        half = own[_POSE:, _POSE:].reshape(2, cameras, _POSE, 2, cameras, _POSE)
-        for camera in range(cameras):
-            both = half[:, camera, :, :, camera]
-            apart = both[0, :, 0] + both[1, :, 1] - both[0, :, 1] - both[1, :, 0]
-            found += float(np.trace(np.linalg.solve(parts.camera, apart)))
-        if self.model.is_distorted:
-            distortion = gtsam.NonlinearFactorGraph()
-            for factor in map(self.model.error_graph.at, range(self.model.error_graph.size())):
-                if [*factor.keys()] == [DISTORTION]:
-                    distortion.add(factor)
-            known = distortion.linearize(self.values).hessian(gtsam.Ordering([DISTORTION]))[0]
-            found += float(np.trace(known @ self.covariance([DISTORTION])))
-        return found
+        errors = self.model.error_graph
+        keys = [*errors.keyVector()]
+        known = errors.linearize(self.values).hessian(to_ordering(keys))[0]
+        return float((known * self.covariance(keys)).sum())
