@@ -261,8 +261,8 @@ def simulate(
         metavar="NAME|RIG",
         rich_help_panel=_PANEL,
         help="kitti, walkley (stereo pairs), surround (six cameras), fisheye (four), omni "
-        "(two that see more than a half-space), panorama (one that sees all round), sample "
-        f"(three small ones), or a rig file; its extrinsics are the truth. (default: {RIG})",
+        "(two that see more than a half-space), sample (three small ones), or a rig file; its "
+        f"extrinsics are the truth. (default: {RIG})",
     ),
     beams: int | None = Option(
         None,
