@@ -31,7 +31,7 @@ Table = TypeVar("Table")
 _POSE = 6  # numbers of one
 _LARGEST = 1e24  # of a covariance: that of a pose that nothing determines is smaller
 _MEASURED = (
-    "timings_s", "residuals", "rounds", "prior_share", "error_sources", "lens", "covariance",
+    "timings_s", "residuals", "rounds", "error_sources", "lens", "covariance",
     "joint_covariance", "pair_covariance", "lens_covariance", "sigmas",
 )  # fmt: skip
 _ROUNDING = 1e-6  # of correlations: other programs may write fewer digits
@@ -172,7 +172,6 @@ class _Parts(BaseModel):
     counts: dict[str, dict[str, int]]
     timings_s: dict[str, float]
     terms: Terms
-    prior_share: dict[str, float]
     error_sources: dict[str, ErrorSources] = {}
     lens: dict[str, tuple[LensEstimate, ...]] = {}
     lens_covariance: dict[str, _JointOfLens] = {}
@@ -230,7 +229,7 @@ def _is_whole(sigmas: Any, camera: str) -> bool:
 
 _OF_ALL_CAMERAS = ("covariance", "camera_verdicts", "counts")
 _OF_SOME_CAMERAS = (
-    "residuals", "stage1_T_camera_lidar", "weaknesses", "prior_share", "error_sources", "lens",
+    "residuals", "stage1_T_camera_lidar", "weaknesses", "error_sources", "lens",
 )  # fmt: skip
 _OTHERWISE = {
     "rig",

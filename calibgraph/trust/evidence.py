@@ -20,7 +20,6 @@ from calibgraph.model.verdict import TOLERANCE, Check
 from calibgraph.solver.error_model import Conflict
 from calibgraph.solver.matches import CameraBlock
 from calibgraph.solver.solution import Solution
-from calibgraph.trust.observability import prior_shares
 from calibgraph.trust.pose_posterior import (
     ImagePosteriors,
     MeasurePosteriors,
@@ -81,7 +80,6 @@ class Evidence:
             matches determine none.
         joint_covariance: (6 N, 6 N) of both, the wider one; cameras that are held are unknown by a
             radian and a metre.
-        prior_shares: per camera, which share of its result comes from priors and relative poses.
     """
 
     solution: Solution
@@ -90,7 +88,6 @@ class Evidence:
     tied: Sequence[tuple[str, ...]]
     bars: ImagePosteriors | None
     joint_covariance: Array | None
-    prior_shares: dict[str, float]
 
     @property
     def cameras(self) -> tuple[str, ...]:
@@ -172,7 +169,7 @@ def gather(
         own = {name: known[rows[name], rows[name]] for group in tied for name in group}
         bars = ImagePosteriors(cameras, known, measure(own, tied))
         joint = bars.widen(known)
-    return Evidence(solution, guess, excluded, tied, bars, joint, prior_shares(solution))
+    return Evidence(solution, guess, excluded, tied, bars, joint)
 
 
 def _tied(solution: Solution) -> list[tuple[str, ...]]:

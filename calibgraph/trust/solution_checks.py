@@ -10,7 +10,6 @@ from calibgraph.model.calibration import Residuals
 from calibgraph.model.lens import LensEstimate
 from calibgraph.model.verdict import COMMON_ERROR, Check
 from calibgraph.solver.error_model import Conflict
-from calibgraph.solver.robust import CAUCHY_SCALE_SIGMAS
 from calibgraph.solver.solution import Solution
 from calibgraph.trust.evidence import Checks, Estimate, Evidence
 from calibgraph.trust.thresholds import threshold
@@ -147,26 +146,8 @@ def repeated_frame_checks(evidence: Evidence) -> Checks:
     return checks
 
 
-def assumed_spread_checks(evidence: Evidence) -> Checks:
-    """The residuals' spread over the one that a configured loss scale stands for."""
-    loss_scale_px = evidence.solution.config.loss_scale_px
-    if loss_scale_px is None:
-        return {}
-    row, residuals = threshold("assumed_spread"), residuals_of(evidence.solution)
-    return {
-        name: [row.check(CAUCHY_SCALE_SIGMAS * residuals[name].sigma_px / loss_scale_px)]
-        for name in evidence.fitted_blocks
-    }
-
-
 def residuals_of(solution: Solution) -> dict[str, Residuals]:
     """Per camera that has correspondences, of all of them, not only the inliers."""
     poses, scales = solution.T_camera_lidar, solution.scales
     blocks = solution.objective.blocks.items()
     return {name: block.summary(poses[name], scales[name]) for name, block in blocks}
-
-
-def prior_share_checks(evidence: Evidence) -> Checks:
-    """How much of a result comes from priors and relative poses."""
-    row = threshold("prior_share")
-    return {name: [row.check(share)] for name, share in evidence.prior_shares.items()}

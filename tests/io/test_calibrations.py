@@ -33,7 +33,6 @@ WRONG: dict[str, Any] = {
     "sigmas": {},
     "timings_s": {"solve": "long"},
     "terms": "all",
-    "prior_share": {"left": "half"},
     "inputs": 3,
     "versions": [1],
     "config": [1],
