@@ -124,8 +124,13 @@ def _check_lens_prior(one: LensEstimate) -> Check:
 
 def flat_evidence_checks(evidence: Evidence) -> Checks:
     """Whether the images leave a pose more open than the matches, where images are known."""
-    flatness = {} if evidence.bars is None else evidence.bars.check_flatness()
-    return {name: [check] for name, check in flatness.items()}
+    checks = {}
+    for name in evidence.posteriors:
+        wide, narrow = evidence.covariance_of(name), evidence.covariance_by_matches(name)
+        if wide is not None and narrow is not None:
+            ratio = float(np.sqrt(np.diag(wide) / np.diag(narrow)).max())
+            checks[name] = [threshold("flat_evidence").check(ratio)]
+    return checks
 
 
 def outlier_frame_checks(evidence: Evidence) -> Checks:
