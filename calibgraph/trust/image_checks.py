@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 from calibgraph.errors import CalibrationError
 from calibgraph.io.dataset import Dataset
@@ -64,30 +64,11 @@ def check_images(
     evidence = measure_image_evidence(
         dataset, Rig(cameras=cameras), places=table.places, seed=seed, progress=progress
     )
-    of_time = {name: pairing_checks(found) for name, found in evidence.items()}
     names = {frame.index: frame.name for frame in dataset.frames}
-    row = threshold("displaced_z_score")
-    placed = {n for n, found in evidence.items() if row.grade(found.displaced_z_score) != "FAIL"}
-    of_placed = {name: checks for name, checks in of_time.items() if name in placed}
     return {
-        name: (*evidence_checks(found, names, tolerance), *of_time[name])
-        + _clouds_checks(of_time[name], of_placed)
+        name: (*evidence_checks(found, names, tolerance), *pairing_checks(found))
         for name, found in evidence.items()
     }
-
-
-def _clouds_checks(
-    own: Sequence[Check], of_placed: Mapping[str, Sequence[Check]]
-) -> tuple[Check, ...]:
-    """Faults of the clouds' time that other cameras show: the clouds are common to all cameras."""
-    if any(check.status != "PASS" for check in own):
-        return ()  # they show it
-    return tuple(
-        Check("clouds of another time", "WARN", f"by camera {other}: {check.text}")
-        for other, checks in of_placed.items()
-        for check in checks
-        if check.status != "PASS"
-    )
 
 
 def evidence_checks(

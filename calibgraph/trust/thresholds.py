@@ -125,12 +125,6 @@ THRESHOLDS: tuple[Threshold, ...] = (
               math.inf, "share", "How many frames are of the same place, or of the same content?",
               "the vehicle stood, a camera or the LiDAR was stuck, or frames are copies: they "
               "count as one frame each; take frames while it drives"),
-    Threshold("assumed_spread", "residual spread over the assumed one", "at most", 2.0, 4.0,
-              "times", "Does the configured loss scale suit the residuals?",
-              "the matches are worse than loss_scale_px (delta) assumes"),
-    # Above half, it shows the priors more than the data.
-    Threshold("prior_share", "share of the priors in the result", "at most", 0.5, 1.0, "share",
-              "How much of the result comes from priors and relative poses?"),
     # the lens, from the residuals and the images
     # By the posterior of a free lens or clock, once from the residuals and once from the images,
     # and by `lens_wrong` etc. What is under the first limit is no reason: right lenses reach it.
@@ -149,12 +143,6 @@ THRESHOLDS: tuple[Threshold, ...] = (
               "deg", "Have the rounds of matching converged?", of_tolerance=True),
     Threshold("last_round_translation", "change in the last round of matching", "at most", 4.0,
               12.0, "cm", "The same.", of_tolerance=True),
-    Threshold("range_rotation", "largest rotation from the guess over the matcher's range",
-              "at most", 1.2, 4.0, "times", "Is the result within what the matcher searches?",
-              "it lies at the edge of the search, or beyond"),
-    Threshold("range_translation", "largest translation from the guess over the matcher's range",
-              "at most", 1.2, 4.0, "times", "The same.",
-              "it lies at the edge of the search, or beyond"),
     Threshold("rematch_rotation", "difference after matching again", "at most", 0.15, 0.5, "deg",
               "Does matching from a displaced start end at the same result?",
               "the images do not determine the extrinsic", of_tolerance=True),

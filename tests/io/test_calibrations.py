@@ -30,7 +30,6 @@ WRONG: dict[str, Any] = {
     "counts": {"left": {"used": "many"}},
     "timings_s": {"solve": "long"},
     "terms": "all",
-    "prior_share": {"left": "half"},
     "inputs": 3,
     "versions": [1],
     "config": [1],
