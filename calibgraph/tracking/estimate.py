@@ -19,7 +19,7 @@ from calibgraph.graph.components import VarianceComponents, VarianceRatios, leas
 from calibgraph.graph.latent_poses import LatentPoseModel
 from calibgraph.graph.objective import objective_graph
 from calibgraph.model.findings import error_components
-from calibgraph.model.geometry import pose_rows, retract_all
+from calibgraph.model.geometry import retract_all
 from calibgraph.model.rig import RelativePose
 from calibgraph.solver.components import (
     Component,
@@ -36,13 +36,11 @@ from calibgraph.solver.within_place import (
     relative_covariance,
     split_excess,
 )
-from calibgraph.tracking.cause import sure_inflation
 from calibgraph.tracking.eliminate import Eliminated, block_diagonal, eliminate
 from calibgraph.tracking.state import Spread, State, rows_of
 from calibgraph.tracking.sums import Numbers, PlaceSums, Sums
 from calibgraph.tracking.window import Window
 
-_PRIOR_FRAMES = 10.0  # weight of the scatter of all frames so far, while a moved camera has few
 _EXACT = 1e-4  # rad and m: what is stated of places to be smaller counts as nothing
 _ROUNDING = 1e-7  # rad and m: a pose that is shared more exactly makes the graph lose digits
 _SETTLED = 50.0  # frames of a camera: an epoch more hardly changes their scatter
@@ -53,18 +51,17 @@ _OPEN_WEIGHINGS, _MOST_WEIGHINGS, _SAME_WEIGHT = 2, 20, 1e-2
 def spread_of(state: State, sums: PlaceSums) -> Spread:
     """What the frames of each camera show of their errors, about the means of their places.
 
-    With an allowance for few frames, as in a batch. While a camera that has moved has few frames,
-    the scatter is shrunk towards that of all its frames so far. Where the matcher states nothing of
-    places it is wider if epochs scatter more than their frames suggest.
+    With an allowance for few frames, as in a batch. Where the matcher states nothing of places it
+    is wider if epochs scatter more than their frames suggest.
     """
     (scatter, left), every = sums.within_places, sums.rows.total()
     hessian, reweighted, frames = every.hessian, every.reweighted, every.frames
     blank = Spread.unknown(len(frames))
     least, excess, efficiency = blank.least, blank.excess, blank.efficiency
     for camera in map(int, np.flatnonzero(frames)):
-        own = _usual_while_few(state, camera, scatter[camera], frames[camera])
+        own = scatter[camera]
         if not states_places(state) and state.scatter_of_frames(camera) is not None:
-            own = own * sure_inflation(state.groups[camera])
+            own = own * state.inflation(camera)
         true = hessian[camera] + WEAK
         own = allow_for_few_frames(
             own, true, left[camera], frames=frames[camera], matches=every.matches[camera]
@@ -73,15 +70,6 @@ def spread_of(state: State, sums: PlaceSums) -> Spread:
         covariance, efficiency[camera] = relative_covariance(own, root, true)
         least[camera], excess[camera] = split_excess(covariance)
     return Spread(least, excess, efficiency)
-
-
-def _usual_while_few(state: State, camera: int, scatter: Array, frames: float) -> Array:
-    """(6, 6) scatter of a camera's frames, that of all before counted in after a move."""
-    if state.moved_at[camera] < 0 or state.walk[camera]:
-        return scatter
-    share, rows = _PRIOR_FRAMES / (frames + _PRIOR_FRAMES), pose_rows(camera)
-    usual = state.total[rows, rows] * (frames / max(state.total_frames[camera], 1.0))
-    return np.asarray((1.0 - share) * scatter + share * usual)
 
 
 def states_places(state: State) -> bool:

@@ -98,12 +98,6 @@ class IncrementalCalibrator:
         """Number of the last frame, None before the first."""
         return self._state.frame
 
-    @property
-    def places(self) -> tuple[str, ...]:
-        """Names of the places that are kept apart, the last visited last."""
-        visited = *self._state.places.names[1:], *self._state.at
-        return tuple(reversed(dict.fromkeys(reversed(visited))))
-
     def calibration(self) -> Calibration:
         """The present estimate as a batch's result."""
         return to_calibration(self._state, self._present())
