@@ -175,7 +175,7 @@ def solve(
     with progress_bar("solving"), checked_arguments():
         seen = None if camera_matches is None else load_camera_matches(camera_matches)
         result = solve(load_rig(rig), correspondences, settings, rare.terms, camera_matches=seen)
-        result = result.with_inputs({str(correspondences): sha256(correspondences)})
+        result = replace(result, inputs={str(correspondences): sha256(correspondences)})
         result = _warned_of_same_data(result, rig)
         written = write_result(result, out)
     if print_graph:
