@@ -37,7 +37,7 @@ from calibgraph.solver.within_place import (
     split_excess,
 )
 from calibgraph.tracking.eliminate import Eliminated, block_diagonal, eliminate
-from calibgraph.tracking.state import Spread, State, rows_of
+from calibgraph.tracking.state import State, rows_of
 from calibgraph.tracking.sums import Numbers, PlaceSums, Sums
 from calibgraph.tracking.window import Window
 
@@ -46,6 +46,37 @@ _ROUNDING = 1e-7  # rad and m: a pose that is shared more exactly makes the grap
 _SETTLED = 50.0  # frames of a camera: an epoch more hardly changes their scatter
 _ROUNDS = 2  # of estimates of the variance ratios, a fit after each
 _OPEN_WEIGHINGS, _MOST_WEIGHINGS, _SAME_WEIGHT = 2, 20, 1e-2
+
+
+@dataclass(frozen=True, eq=False)
+class Spread:
+    """What the frames of each camera show of their errors, as ``calibgraph.solver.within_place``.
+
+    Attributes:
+        least: (n,) k, variance of matches of what they do not share, over that of independent ones.
+        excess: (n, 6, 6) K - k.
+        efficiency: (n,) of independent matches: their true variance over that of H, in the mean.
+    """
+
+    least: Array
+    excess: Array
+    efficiency: Array
+
+    @staticmethod
+    def unknown(cameras: int) -> Spread:
+        """Of independent matches."""
+        excess = np.tile(1e-3 * np.eye(6), (cameras, 1, 1))
+        return Spread(np.ones(cameras), excess, np.ones(cameras))
+
+    def mean_variance(self, place_variance: float, alike: Array) -> Array:
+        """(n,) of all matches of a camera, in units of independent ones, in the mean over a pose.
+
+        Args:
+            place_variance: of the matcher.
+            alike: (n,) frames of a place.
+        """
+        within = self.least + np.trace(self.excess, axis1=1, axis2=2) / 6
+        return np.asarray(within + place_variance * self.efficiency * alike)
 
 
 def spread_of(state: State, sums: PlaceSums) -> Spread:
@@ -229,7 +260,7 @@ class EpochGraph:
         self.places = closed_places(state)
         frames = self.places.frames.sum(axis=0)
         self._is_settled = bool((frames[state.started] >= _SETTLED).all())
-        self.spread = state.spread
+        self.spread = spread_of(state, self.places)
         self.pose_graph = pose_priors(state)
         T = dict(zip(state.names, state.references, strict=True))
         self.prior = pose_equations(self.pose_graph, state.names, T)
@@ -435,7 +466,6 @@ def every_place(state: State, closed: PlaceSums, sums: Sums) -> PlaceSums:
 
 def settle(state: State) -> EpochGraph:
     """Find optimum, weights and variance ratios of the closed epochs; the graph with these."""
-    state.spread = spread_of(state, closed_places(state))
     graph = EpochGraph(state)
     rows = np.flatnonzero(graph.places.frames.any(axis=1)).tolist()
     shows_ratios = len(rows) > 1 or bool(len(rows) and state.rig.relative_poses)
