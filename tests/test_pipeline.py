@@ -31,7 +31,7 @@ from tests.draws.lenses import with_known_lenses
 from tests.matching.structure.data import with_noise_images
 from tests.solver.test_places import minimize
 
-pytestmark = pytest.mark.usefixtures("blank_diagrams", "no_image_checks")
+pytestmark = pytest.mark.usefixtures("no_image_checks")
 
 FRAMES = 6
 STATED = {

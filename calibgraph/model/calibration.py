@@ -272,8 +272,11 @@ class Calibration:
     @property
     def not_included(self) -> str:
         """The errors that the bars leave out: relative poses show the clouds' scale."""
-        table = self.correspondences
-        moves = table is not None and table.twist_per_s is not None
+        table, cameras = self.correspondences, self.rig.cameras.values()
+        if table is None:  # of a tracker, which corrects for the motion what the rig states
+            moves = any(camera.time_offset_s or camera.readout_s for camera in cameras)
+        else:
+            moves = table.twist_per_s is not None
         return left_out(self.config, self.rig, has_new_lens=bool(self.lens), motion_known=moves)
 
     def error_bar_holds(self, name: str) -> bool:
@@ -293,10 +296,6 @@ class Calibration:
         """The joint covariance of a camera's pose and lens, with the names of its rows."""
         rows = joint_parameters(self.lens[name])
         return {"parameters": rows, "covariance": self.lens_covariance[name].tolist()}
-
-    def with_inputs(self, inputs: Mapping[str, str]) -> Calibration:
-        """The same result with the SHA-256 of its input files, by path."""
-        return replace(self, inputs=dict(inputs))
 
     def save(self, folder: Path | str) -> Path:
         """Write ``calibration.yaml``, and tables of the matches if there are any, into a folder.

@@ -111,6 +111,7 @@ CAUSES: dict[str, Cause] = {
     "frames": Cause(
         _FRAMES,
         {"outlier_frames": "", "place_distance": "", "place_inliers": "",
+         "frames_best": "Look at the frames that are named, and leave them out if something moved.",
          "disagreeing_frames": "Check whether the camera was moved.",
          "drift": "Check whether the camera's mount is loose."},
     ),

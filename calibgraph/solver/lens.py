@@ -131,7 +131,7 @@ def considered_lens(camera: Camera, block: ProjectionBlock) -> LensVariable:
 
     And of the clock, where the motion of the LiDAR is known.
     """
-    parts: list[LensPart] = [] if camera.model == "equirectangular" else [*_LENS]
+    parts: list[LensPart] = [*_LENS]
     if block.motion is not None:
         parts += ["offset", "readout"] if camera.readout_sigma_s else ["offset"]
     return LensVariable.of(camera, parts, LensSigmas.calibrated(camera))

@@ -179,8 +179,6 @@ def measure_lens(  # noqa: PLR0913 - what is measured, and by what
     From a camera at the result and its scores there at the level ``WIDE``. Of the principal point,
     the coordinate along the longer side of the image is free.
     """
-    if camera.model == "equirectangular":
-        return ()  # its format determines it
     # Across the longer side of the image, a principal point cannot be told from a rotation.
     along = Free.CENTRE_X if camera.width_px >= camera.height_px else Free.CENTRE_Y
     finer = Free.FOCAL, Free.RADIAL, along  # right shapes are nearer to zero without a finer fit
@@ -318,14 +316,21 @@ def evidence_checks(
             "image and cloud"
         )
         return (Check("image evidence", "WARN", text, found.groups),)
-    row, advice, lost = threshold("displaced_z_score"), "", found.frames_lost
-    if found.frames_best < limit("frames_best"):
-        advice = f"{row.advice}; frames {', '.join(names[n] for n in lost[:5])} fit another better"
-    displaced = row.check(found.displaced_z_score, advice=advice)
+    displaced = threshold("displaced_z_score").check(found.displaced_z_score)
+    of_pose = displaced, frames_check(found, names)
     mispaired = found.frames_best <= limit("lens_frames_best")
     if found.displaced_z_score < limit("lens_z_score") or mispaired:
-        return (displaced,)  # at a wrong extrinsic the lens cannot be measured
-    return displaced, *(check_parameter(each, IMAGES, tolerance) for each in found.lens)
+        return of_pose  # at a wrong extrinsic the lens cannot be measured
+    return *of_pose, *(check_parameter(each, IMAGES, tolerance) for each in found.lens)
+
+
+def frames_check(found: ImageEvidence, names: Mapping[int, str]) -> Check:
+    """Whether the frames of a camera fit one extrinsic: something may have moved meanwhile.
+
+    A solve leaves such frames out, and the rest agrees.
+    """
+    row, lost = threshold("frames_best"), ", ".join(names[n] for n in found.frames_lost[:5])
+    return row.check(found.frames_best, advice=f"{lost} fit another extrinsic better: {row.advice}")
 
 
 def pairing_checks(found: ImageEvidence) -> tuple[Check, ...]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -23,6 +24,7 @@ from calibgraph.trust.image_evidence import (
     ImageEvidence,
     check_images,
     evidence_checks,
+    frames_check,
     measure_image_evidence,
     pairing_checks,
 )
@@ -83,8 +85,28 @@ def test_mispaired_clouds_fail_and_point_to_the_neighbour(dataset: Dataset, trut
 def test_a_single_mispaired_frame_is_named(dataset: Dataset, truth: Rig) -> None:
     found = measure_image_evidence(with_clouds_of(dataset, [0, 1, 2, 5, 4, 5]), truth)[NAME]
     assert found.frames_lost == (3,)
-    worse = replace(found, displaced_z_score=3.5, frames_best=0.7)
-    assert "; frames 000003 fit another better" in evidence_checks(worse, NAMES)[0].text
+    assert statuses(found)["share of the frames that fit the result best"] == "PASS"
+
+
+@pytest.mark.usefixtures("no_lens")
+def test_a_camera_that_turns_halfway_is_no_pass(
+    dataset: Dataset, truth: Rig, tmp_path: Path
+) -> None:
+    """Its first frames agree on one pose, and matches of the others are left out."""
+    camera, frames = truth.cameras[NAME], list(dataset.frames)
+    k = camera.intrinsics_px
+    K = np.array([[k.fx, 0, k.cx], [0, k.fy, k.cy], [0, 0, 1]])
+    warp = K @ Rotation.from_euler("y", 2.0, degrees=True).as_matrix() @ np.linalg.inv(K)
+    for number in (3, 4, 5):
+        path = tmp_path / f"{number}.png"
+        image = cv2.imread(str(frames[number].image_paths[NAME]))
+        cv2.imwrite(str(path), cv2.warpPerspective(image, warp, image.shape[1::-1]))
+        paths = {**frames[number].image_paths, NAME: path}
+        frames[number] = replace(frames[number], image_paths=paths)
+    found = measure_image_evidence(replace(dataset, frames=tuple(frames)), truth)[NAME]
+    check = frames_check(found, NAMES)
+    assert check.status == "WARN"
+    assert "000003, 000004, 000005 fit another extrinsic better" in check.text
 
 
 @pytest.mark.usefixtures("no_lens")
