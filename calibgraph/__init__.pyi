@@ -68,7 +68,6 @@ from .model.verdict import Check as Check
 from .model.verdict import Verdict as Verdict
 from .pipeline import calibrate as calibrate
 from .pipeline import solve as solve
-from .report.mcap_file import write_mcap as write_mcap
 from .simulation.correspondences import MatcherErrors as MatcherErrors
 from .simulation.correspondences import simulate_correspondences as simulate_correspondences
 from .simulation.recording import simulate_street as simulate_street

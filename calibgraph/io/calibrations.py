@@ -35,7 +35,7 @@ Table = TypeVar("Table")
 
 _POSE = 6  # numbers of one
 _MEASURED = (
-    "timings_s", "residuals", "rounds", "prior_share", "error_sources", "lens", "covariance",
+    "timings_s", "residuals", "rounds", "error_sources", "lens", "covariance",
     "joint_covariance", "pair_covariance", "lens_covariance", "sigmas",
 )  # fmt: skip
 
@@ -137,7 +137,6 @@ class _Parts(BaseModel):
     counts: dict[str, dict[str, int]]
     timings_s: dict[str, float]
     terms: Terms
-    prior_share: dict[str, float]
     error_sources: dict[str, ErrorSources] = {}
     lens: dict[str, tuple[LensEstimate, ...]] = {}
     lens_covariance: dict[str, _JointOfLens] = {}
@@ -184,7 +183,7 @@ def _require_consistent(
 
 _OF_ALL_CAMERAS = ("covariance", "camera_verdicts", "counts")
 _OF_SOME_CAMERAS = (
-    "residuals", "stage1_T_camera_lidar", "weaknesses", "prior_share", "error_sources", "lens",
+    "residuals", "stage1_T_camera_lidar", "weaknesses", "error_sources", "lens",
 )  # fmt: skip
 _PLAIN = {f.name for f in fields(Calibration)} & _Parts.model_fields.keys() - {"lens_covariance"}
 """The parts that are those of a calibration as they are."""

@@ -60,7 +60,7 @@ def _intrinsics(camera: Camera) -> Iterator[str]:
     elif not low < camera.lens.pixels_per_rad / max(size) < high:
         mistake = "millimetres?" if camera.lens.pixels_per_rad < max(size) else "of another image?"
         yield f"focal length {k.fx:.4g} px of {image}: {mistake}"
-    elif camera.model != "equirectangular":
+    else:
         offset = np.abs([k.cx / size[0], k.cy / size[1]] - np.array(0.5))
         if max(offset) > _CENTRE_SHARE or min(offset) > _CENTRE_SHARE_OF_BOTH:
             yield (

@@ -134,7 +134,6 @@ LENS_NAMES: Final[Mapping[LensModel, tuple[str, ...]]] = {
     "omnidirectional": (
         "omnidirectional", "omni", "omnidir", "mei", "unified", "omni_radtan", "omni_none",
     ),
-    "equirectangular": ("equirectangular", "panorama", "spherical", "equirect", "panoramic"),
 }  # fmt: skip
 """Names of ROS, Kalibr, OpenCV, camodocal, COLMAP, Basalt, multical and others; the first is ours.
 Capitals, hyphens, blanks and a `Camera` or `model` at the end do not count."""

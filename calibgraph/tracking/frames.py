@@ -48,7 +48,7 @@ PLACE = "place"
 """Key of a frame's metadata: the name of the place that it is of."""
 
 _LONGEST_PLACE = 200
-_DATASET = "to track a dataset, say what matches its frames: --matcher structure"
+_DATASET = "match its frames first, with `calibgraph match` or as in docs/tracking.md"
 _FINDINGS_PER_FRAME = (
     "systematic_rotation_rad", "systematic_translation_m", "camera_share",
     "elevation_rad", "elevation_stretch", "scan_motion_m",

@@ -17,8 +17,6 @@ from calibgraph.io.calibrations import stated_result
 from calibgraph.report.html import write_result
 from tests.conftest import CommandRun
 
-pytestmark = pytest.mark.usefixtures("blank_diagrams")
-
 WRONG: dict[str, Any] = {
     "covariance": {"left": [[1.0]]},
     "joint_covariance": [[1.0]],
@@ -32,7 +30,6 @@ WRONG: dict[str, Any] = {
     "counts": {"left": {"used": "many"}},
     "timings_s": {"solve": "long"},
     "terms": "all",
-    "prior_share": {"left": "half"},
     "inputs": 3,
     "versions": [1],
     "config": [1],

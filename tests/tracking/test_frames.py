@@ -186,7 +186,7 @@ def test_a_source_that_is_none_is_refused_at_once(tmp_path: Path) -> None:
         "missing.parquet: no such file": lambda: frames_of(tmp_path / "missing.parquet"),
         "cannot be read": lambda: frames_of("x" * 300),
         "is no file that can be read": lambda: frames_of(tmp_path / "pipe"),
-        "is no table of correspondences; to track a dataset": lambda: frames_of(tmp_path),
+        "is no table of correspondences; match its frames": lambda: frames_of(tmp_path),
     }
     for message, call in calls.items():
         with pytest.raises(FileError, match=message):

@@ -175,15 +175,6 @@ def carried_coefficients(name: str, camera: Camera, most: int, what: str) -> lis
     return padded[:most]
 
 
-def no_place_for(name: str, camera: Camera, what: str) -> CalibrationError:
-    """The error of a format that has no place for a camera's lens model."""
-    return CalibrationError(
-        f"camera {name!r}: {what} cannot hold a lens of the model {camera.model}; choose another "
-        "--format (opencv, json), or undistort the images and calibrate these",
-        camera=name,
-    )
-
-
 def commented_yaml(statement: Iterable[str], content: dict[str, Any]) -> str:
     """YAML below its statement of direction."""
     return "".join(f"# {line}\n" for line in statement) + yaml_text(content)
@@ -409,8 +400,6 @@ def _of_kalibr(export: RigExport, names: list[str], index: int) -> dict[str, Any
 def _projection(name: str, camera: Camera) -> dict[str, Any]:
     intrinsics = [*camera.intrinsics_px.model_dump().values()]
     model, distortion, coefficients = "pinhole", "radtan", [*camera.distortion]
-    if camera.model == "equirectangular":
-        raise no_place_for(name, camera, "Kalibr's camchain")
     if camera.model == "omnidirectional":
         model, intrinsics, coefficients = "omni", [coefficients[0], *intrinsics], coefficients[1:]
     elif camera.model == "fisheye":
@@ -452,9 +441,7 @@ def _of_ros(name: str, camera: Camera) -> dict[str, Any]:
     if camera.model == "pinhole":
         distortion += [0.0] * (_PLUMB_BOB - len(distortion))
     is_rational = camera.model == "pinhole" and len(distortion) > _PLUMB_BOB
-    model = "rational_polynomial" if is_rational else _MODELS.get(camera.model)
-    if model is None:
-        raise no_place_for(name, camera, "ROS's camera_info")
+    model = "rational_polynomial" if is_rational else _MODELS[camera.model]
     return {
         "image_width": camera.width_px,
         "image_height": camera.height_px,

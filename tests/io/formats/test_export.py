@@ -247,8 +247,6 @@ def test_a_file_has_what_the_parser_of_ros_requires(tmp_path: Path) -> None:
 
 
 def test_what_has_no_place_in_files_of_ros_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(CalibrationError, match="cannot hold a lens of the model equirect"):
-        export_calibration(rig_of("panorama"), tmp_path / "infos", "camera_info")
     camera = make_pair().cameras["left"]
     other = camera.model_copy(update={"frame_id": "other"})
     for names in (("a b", "a_b"), ("A_b", "a_b")):  # one file where systems ignore case
@@ -322,14 +320,3 @@ def test_a_unified_lens_is_imported_as_it_was_exported(
     np.testing.assert_allclose(again.T_camera_lidar, omni.T_camera_lidar, atol=1e-9)
     theirs, ours = (c.model_dump(exclude={"T_camera_lidar"}) for c in (again, omni))
     assert theirs == ours
-
-
-def test_a_panorama_is_written_where_there_is_room_for_it(tmp_path: Path) -> None:
-    rig = rig_of("panorama")
-    for format in ("opencv", "json", "urdf"):
-        export_calibration(rig, tmp_path / f"{format}.yml", format)
-    again = import_rig([tmp_path / "opencv.yml"]).cameras["panorama"]
-    pixels, _ = rig.cameras["panorama"].lens.project(POINT)
-    np.testing.assert_allclose(again.lens.project(POINT)[0], pixels, atol=1e-9)
-    with pytest.raises(CalibrationError, match="cannot hold a.* equirectangular"):
-        export_calibration(rig, tmp_path / "chain.yaml", "kalibr")
