@@ -32,7 +32,6 @@ from .guessing.template import write_rig_template as write_rig_template
 from .io.bags.camera_info import camera_from_message as camera_from_message
 from .io.bags.pictures import image_from_message as image_from_message
 from .io.bags.point_clouds import cloud_from_message as cloud_from_message
-from .io.bags.rig import rig_of_bag as rig_of_bag
 from .io.bags.storage import BagOptions as BagOptions
 from .io.calibrations import load_calibration as load_calibration
 from .io.dataset import Dataset as Dataset

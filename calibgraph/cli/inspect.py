@@ -257,8 +257,8 @@ def simulate(
         "kitti",
         metavar="NAME|RIG",
         help="kitti, walkley (stereo pairs), surround (six cameras), fisheye (four), omni "
-        "(two that see more than a half-space), panorama (one that sees all round), sample "
-        "(three small ones), or a rig file; its extrinsics are the truth.",
+        "(two that see more than a half-space), sample (three small ones), or a rig file; its "
+        "extrinsics are the truth.",
     ),
     beams: int = Option(64, metavar="16|32|64|128", help="Of the LiDAR."),
     step_m: float = Option(4.0, help="Mean distance between frames."),

@@ -5,6 +5,7 @@ import os
 import shutil
 import time
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -102,7 +103,7 @@ def _solve(task: JobTask, progress: Progress) -> Outcome:
     assert rig is not None and table is not None  # of each job
     progress("solving", 0, 1)
     result = solve(load_rig(rig), table, settings.config, settings.terms)
-    result = result.with_inputs({str(table): sha256(table)})
+    result = replace(result, inputs={str(table): sha256(table)})
     return _write(task, result, None, with_report=settings.report)
 
 

@@ -45,13 +45,12 @@ def test_the_file_has_the_cameras_and_image_sizes_of_the_folder(
     assert {(c["width_px"], c["height_px"]) for c in cameras.values()} == {(640, 360)}
 
 
-@pytest.mark.parametrize("command", ["calibrate", "match", "track"])
+@pytest.mark.parametrize("command", ["calibrate", "match"])
 def test_an_unfilled_file_is_refused_with_the_key_that_is_left(
     recording: Path, call: Call, command: str
 ) -> None:
     write_rig_template(recording)
-    rig = [recording / "rig.yaml"] if command == "track" else []
-    line = error_line(*call(command, *rig, recording, "--out", recording.parent / "out.parquet"))
+    line = error_line(*call(command, recording, "--out", recording.parent / "out.parquet"))
     assert "cameras.front_left.intrinsics_px.fx is still FILL_IN, and 17 more keys" in line
 
 

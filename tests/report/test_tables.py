@@ -43,7 +43,6 @@ def extreme() -> Calibration:
         covariance=dict.fromkeys(NAMES, COVARIANCE),
         residuals=dict.fromkeys(NAMES, Residuals(12345.678, 1.0, 1.0, 1.0, 1.0)),
         counts=dict.fromkeys(NAMES, {"used": 12_345_678, "frames_used": 100_000}),
-        prior_share=dict.fromkeys(NAMES, 1.0),
         lens=dict.fromkeys(NAMES, (lens,)),
     )
 
