@@ -87,9 +87,6 @@ simulate street --rig nosuch --out never | known are kitti, walkley, surround
 simulate street --beams 3 --out never | 3 beams
 simulate street --frames 0 --out never | 0 frames, 4.0 m apart: expected at least 1 frame
 simulate street --rotation-deg 200 --out never | expected an angle within
-track rig.yaml table.parquet --motion scans | --motion goes with --matcher only
-track rig.yaml table.parquet --weights a.tar | --weights goes with --matcher only
-track rig.yaml table.parquet table.parquet | several go with --matcher only
 weights bad.tar | bad.tar
 """
 CONFIGS = {
