@@ -15,10 +15,10 @@ import gtsam
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.graph.latent_poses import LatentPoseModel
+from calibgraph.graph.latent_poses import LatentPoseModel, to_ordering
 from calibgraph.graph.variables import CLOUD, DISTORTION, camera_key, matched_key
 from calibgraph.model.config import Reported
-from calibgraph.model.geometry import adjoints, pose_rows, to_T_lidar_camera
+from calibgraph.model.geometry import adjoints, to_T_lidar_camera
 
 _RELINEARIZE = 0.1  # rad and m: beyond all that an epoch may move
 _ROUNDING = 1e-11  # of the diagonal: what cloud and cameras share leaves a quadratic open
@@ -126,21 +126,7 @@ class Window:
 
     def undetermined(self) -> float:
         """Degrees of freedom of the shared errors that the data leave open."""
-        parts, size = self.model.components, _POSE * len(self._poses)
-        own = self.covariance([*self._keys, *self._mount_keys])
-        found = float(np.trace(np.linalg.solve(parts.cloud, own[:_POSE, :_POSE])))
-        bent = self.model.alignment.reshape(size, -1)[:, : len(own) - _POSE - 2 * size]
-        tied = np.hstack([-np.eye(size), np.eye(size), bent])
-        apart = tied @ own[_POSE:, _POSE:] @ tied.T
-        found += sum(
-            float(np.trace(np.linalg.solve(parts.camera, apart[rows, rows])))
-            for rows in map(pose_rows, range(len(self._poses)))
-        )
-        if self.model.is_distorted:
-            distortion = gtsam.NonlinearFactorGraph()
-            for factor in map(self.model.error_graph.at, range(self.model.error_graph.size())):
-                if [*factor.keys()] == [DISTORTION]:
-                    distortion.add(factor)
-            known = distortion.linearize(self.values).hessian(gtsam.Ordering([DISTORTION]))[0]
-            found += float(np.trace(known @ self.covariance([DISTORTION])))
-        return found
+        errors = self.model.error_graph
+        keys = [*errors.keyVector()]
+        known = errors.linearize(self.values).hessian(to_ordering(keys))[0]
+        return float((known * self.covariance(keys)).sum())
