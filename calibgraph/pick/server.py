@@ -27,7 +27,7 @@ from calibgraph.io.frame import Frame
 from calibgraph.io.rigs import REFERENCE_FILE
 from calibgraph.matching.structure.visibility import find_in_view, find_visible
 from calibgraph.model.geometry import degrees_and_centimetres
-from calibgraph.model.rig import Camera, Rig
+from calibgraph.model.rig import Camera
 from calibgraph.pick.estimate import (
     SESSION_FILE,
     CameraEstimate,
