@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calibgraph.arrays import Array
-from calibgraph.graph.by_place import place_of
+from calibgraph.graph.latent_poses import place_of
 from calibgraph.graph.lens import LensVariable
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences

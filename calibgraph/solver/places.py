@@ -193,8 +193,7 @@ class Linearization:
         """The sums of every pair by place, in the tangents of o_p, n_a and n_b: (r, 18, 18)."""
         found = []
         for pair in self.model.pairs:
-            numbers = [self.model.cameras.index(name) for name in (pair.a, pair.b)]
-            shown = _poses(self.shared, map(paired_key, numbers))
+            shown = _poses(self.shared, pair.keys)
             seen = self.inverses[0, pair.places] @ shown[:, None]
             sums = pair.block.run_sums(seen[0], seen[1], pair.edges)
             by_cloud = -adjoints(invert_each(seen.reshape(-1, 4, 4))).reshape(2, -1, 6, 6)
@@ -281,7 +280,7 @@ class Linearization:
         """(n, n) and (n,) gradient of linear factors of shared variables."""
         n, present = self.model.size, {*factors.keys()}
         hessian, gradient = np.zeros((n, n)), np.zeros(n)
-        keys = [key for key in self.model.shared_keys if key in present]
+        keys = [key for key in self.model.columns if key in present]
         own, at = factors.hessian(to_ordering(keys)), self.model.columns_of(keys)
         hessian[np.ix_(at, at)], gradient[at] = own[0], -own[1]
         return hessian, gradient
