@@ -218,10 +218,11 @@ def error_model(
             blocks[name] = replace(placed, free=lens.free)
         shown[name] = within, evidence
     pairs = [pair for pair in inliers.pairs if len(pair.frame)]  # the gate may leave none
-    components = variance_components(findings, cameras, shown, places=len(places))
+    rigid = common_error(findings.rigid_sigmas, findings.camera_share)
     if not any(findings.systematic_sigmas) and inliers.pairs:  # nothing is stated
         unknown = MatcherFindings(**error_components().matchers[UNKNOWN])
-        components = common_error(components, unknown.systematic_sigmas, unknown.camera_share)
+        rigid = common_error(unknown.systematic_sigmas, unknown.camera_share)
+    components = variance_components(findings, cameras, shown, places=len(places), rigid=rigid)
     features = pairs_by_place(pairs, places, cameras)
     components = replace(
         components,
