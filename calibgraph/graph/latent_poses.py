@@ -241,12 +241,8 @@ class LatentPoseModel:
     @cached_property
     def shared_graph(self) -> gtsam.NonlinearFactorGraph:
         """The factors of what all places share: of errors, pose graph, lenses."""
-        return join(self.error_graph, self.pose_graph, self.lens_graph)
-
-    @cached_property
-    def lens_graph(self) -> gtsam.NonlinearFactorGraph:
-        """Those of lenses."""
-        return lens_graph(self.lenses, is_distorted=self.is_distorted)
+        lenses = lens_graph(self.lenses, is_distorted=self.is_distorted)
+        return join(self.error_graph, self.pose_graph, lenses)
 
     @cached_property
     def error_graph(self) -> gtsam.NonlinearFactorGraph:

@@ -204,9 +204,9 @@ def error_model(
         placed, evidence = replace(by_place, block=block_of_graph), None
         lens, number = inliers.lenses.get(name), cameras.index(name)
         if any(findings.bend_sigmas):
-            weak, pose = weak_information(lens), at.pose(name)
+            weak, T = weak_information(lens), at.T_camera_lidar[name]
             evidence = distortion_evidence(
-                block, at.scales[name], pose, weak, places=places, lens=lens
+                block, at.scales[name], T, weak, places=places, lens=lens
             )
         blocks[name] = placed
         if lens is not None:
