@@ -219,7 +219,7 @@ def to_record(audit: Audit) -> Record:
     return {
         "wrong": list(audit.wrong),
         "cameras": {name: _camera(camera, rate) for name, camera in audit.cameras.items()},
-        "motion": None if audit.lidar is None else by_unit("motion", audit.lidar.motion),
+        "motion": None if audit.lidar is None else by_unit("motion", audit.lidar.deviation),
     }
 
 

@@ -58,7 +58,7 @@ def test_the_lidar_is_told_from_all_cameras() -> None:
     lidar = found.lidar[-1]
     assert lidar is not None
     np.testing.assert_allclose(
-        np.degrees(lidar.motion[:3]), [0, 0, 1], atol=4 * np.degrees(lidar.sigma[:3].max())
+        np.degrees(lidar.deviation[:3]), [0, 0, 1], atol=4 * np.degrees(lidar.sigma[:3].max())
     )
 
 
