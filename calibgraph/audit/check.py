@@ -53,8 +53,7 @@ from calibgraph.solver.solution import Solution
 from calibgraph.trust.agreement import competing_solution_checks, pair_agreement_checks
 from calibgraph.trust.evidence import Checks, Evidence, concatenate, gather_of_run
 from calibgraph.trust.guess import point_distance_checks
-from calibgraph.trust.image_checks import frames_check
-from calibgraph.trust.image_evidence import measure_image_evidence
+from calibgraph.trust.image_evidence import frames_check, measure_image_evidence
 from calibgraph.trust.inputs import describe_copies
 from calibgraph.trust.lens_checks import intrinsics_checks
 from calibgraph.trust.matcher_checks import last_round_checks, matcher_checks

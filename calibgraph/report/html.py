@@ -35,7 +35,6 @@ from calibgraph.report.page_overlays import (
     write_overlays,
 )
 from calibgraph.report.plots import reprojection_errors, residual_map
-from calibgraph.solver.pairs import match_errors_px
 
 
 def write_report(result: Calibration, path: Path | str) -> Path:
@@ -125,12 +124,11 @@ def _camera_pairs(result: Calibration) -> list[dict[str, Any]]:
         return rows
     for a, b in table.pairs():
         matches = table.of_pair(a, b)
-        errors_px = match_errors_px(result.rig, matches)
-        known, name = errors_px[~np.isnan(errors_px)], f"relative pose of {a} and {b} by images"
+        known = np.isfinite(matches.planes_lidar_per_m[:, :, 0]).any(axis=1)
+        name = f"relative pose of {a} and {b} by images"
         rows.append({
-            "name": f"{a}, {b}", "matches": len(matches), "surfaces": len(known),
+            "name": f"{a}, {b}", "matches": len(matches), "surfaces": int(known.sum()),
             "frames": len(np.unique(matches.frame)),
-            "median_px": f"{np.median(known):.2f}" if len(known) else "-",
             "check": next((c for c in result.camera_verdicts[a].checks if c.name == name), None),
         })  # fmt: skip
     return rows

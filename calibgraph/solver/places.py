@@ -56,6 +56,7 @@ TOLERANCE = 1e-6
 _FREE = 1e3  # rad and m: a standard deviation that no correspondences have
 _SHARES = 0.5 ** np.arange(12)
 """Of a step: the first that descends; mostly the whole step."""
+_FARTHEST, _LEAST = 2.5, 0.1  # steps at once, where the slope shows that it pays
 
 
 class Ties(NamedTuple):
@@ -306,15 +307,22 @@ class Linearization:
         """Twice GTSAM's error."""
         of_data = float(sum(sums.cost.sum() for sums in (self.data, *self.pairs)))
         ties = self.ties.cost(self.model.components.robust_scale)
-        return of_data + ties + 2.0 * self.model.shared_graph.error(self.shared)
+        if self.model.lenses:  # whose priors are robust
+            return of_data + ties + 2.0 * self.model.shared_graph.error(self.shared)
+        return of_data + ties + 2.0 * self.shared_factors.error(self.shared.zeroVectors())
+
+    @cached_property
+    def gradient(self) -> Array:
+        """(n,) by the shared variables, places eliminated."""
+        gradient, own = self.shared_hessian[1].copy(), self.places.gradient.sum(axis=0)
+        gradient[: len(own)] += own
+        return gradient
 
     @cached_property
     def step(self) -> Array:
         """(n,) of the shared variables, by Gauss-Newton."""
-        gradient, own = self.shared_hessian[1].copy(), self.places.gradient.sum(axis=0)
-        gradient[: len(own)] += own
         scaled, units = unit_diagonal(self.hessian())
-        return -np.asarray(np.linalg.solve(scaled, gradient / units)) / units
+        return -np.asarray(np.linalg.solve(scaled, self.gradient / units)) / units
 
     def moved(self, share: float) -> Linearization:
         """The graph after a part of the step."""
@@ -328,14 +336,6 @@ class Linearization:
         moved = retract_all(self.inverses.reshape(-1, 4, 4), steps.reshape(-1, 6))
         shared = self.shared.retract(of_shared)
         return Linearization(model, shared, moved.reshape(self.inverses.shape))
-
-    def descend(self) -> Linearization | None:
-        """The graph after a step, shortened until it descends; None if no step does."""
-        for share in _SHARES:
-            tried = self.moved(share)
-            if tried.cost <= self.cost:
-                return tried
-        return None
 
     def is_determined(self) -> bool:
         """Whether every direction of every camera is: of a free one rounding leaves far more."""
@@ -473,19 +473,30 @@ def fit_latent_poses(
         relative_tolerance: relative change of the cost at which it stops.
     """
     present = start if start.model is model else start.with_model(model)
-    change = np.inf
+    change, reach = np.inf, 1.0
     for _ in range(MAX_ITERATIONS):
         try:
-            found = present.descend()
+            tried = ((share, present.moved(share)) for share in (reach, *_SHARES))
+            lower = ((share, each) for share, each in tried if each.cost <= present.cost)
+            share, found = next(lower, (0.0, present))
         except np.linalg.LinAlgError:
             return None
-        if found is None:  # this is the minimum, to rounding
+        if not share:  # this is the minimum, to rounding
             return ErrorFit(present, 0.0)
         change = (present.cost - found.cost) / max(present.cost, np.finfo(float).tiny)
-        present = found
         if change <= relative_tolerance:
-            break
+            return ErrorFit(found, change)
+        before, left = (float(each.gradient @ present.step) for each in (present, found))
+        reach, present = lengthen(share, left / before), found
     return ErrorFit(present, change)
+
+
+def lengthen(share: float, left: float) -> float:
+    """The next step's length, where the last of this length has left so much of the slope.
+
+    A robust loss is flatter than its weights say, so that Gauss-Newton falls short.
+    """
+    return float(np.clip(share / max(1.0 - left, _LEAST), 1.0, _FARTHEST))
 
 
 def start_values(model: LatentPoseModel, T_camera_lidar: Mapping[str, Array]) -> Linearization:

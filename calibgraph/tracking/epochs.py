@@ -17,7 +17,7 @@ from calibgraph.solver.within_place import WEAK
 from calibgraph.tracking.absorption import add_to_totals, count_epoch
 from calibgraph.tracking.estimate import EpochGraph, locate_places
 from calibgraph.tracking.events import Event
-from calibgraph.tracking.gate import Gated, frame_sums
+from calibgraph.tracking.gate import Gated, sums_of
 from calibgraph.tracking.moves import report_drift, select_walk, shift_between, update_evidence
 from calibgraph.tracking.state import STRENGTHS, State
 from calibgraph.tracking.sums import Numbers, Sums
@@ -122,21 +122,18 @@ def _regate(state: State, camera: int, places: Numbers) -> None:
         least = max(robust_spread(sizes), raw.least_spread)
         scale = scale_from(robust_spread(sizes_px), least, state.config)
     within = sizes_px * median_norm(raw.information) <= scale.gate_px
-    gated = Gated(
-        poses[-1], raw, within, np.add.reduceat(within, raw.frame_edges[:-1], dtype=float)
-    )
+    starts = raw.frame_edges[:-1]
+    gated = Gated(poses[-1:], raw, within, np.add.reduceat(within, starts, dtype=float))
     state.put(camera, scales=scale, share=gated.usual_share)
     newest = gated.select(epochs == epochs[-1]) if state.walk[camera] else gated
     if newest.enough.any():
         state.put(camera, curvature=newest.curvature(scale))
     within = np.where(np.repeat(gated.enough, frames), within, own[1])
-    counts = np.add.reduceat(within, raw.frame_edges[:-1], dtype=np.int64)
+    counts = np.add.reduceat(within, starts, dtype=float)
     steps = _linearized_at(state, camera, epochs, places[rows])
     poses = retract_all(np.tile(state.references[camera], (len(steps), 1, 1)), steps)
-    runs = to_runs(np.concatenate([[0], counts.cumsum()]))
-    here = raw.with_scale(scale).select(within).run_sums(poses, runs)
-    sums = frame_sums(here, state.curvature[camera], -steps, counts.astype(np.float64))
     state.put(camera, blocks=(raw,), inliers=(within,))
+    sums = sums_of(state, {camera: Gated(poses, raw, within, counts)})
     state.sums = state.sums.replace_at((rows, camera), sums)
 
 

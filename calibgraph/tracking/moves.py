@@ -523,9 +523,7 @@ def _sums_since(state: State, detected: DetectedStep) -> Sums:
         T = refine(raw, start, scale, state.config)
         gated = Gated.at(T, raw, scale)
         if gated.counts.sum() >= MIN_MATCHES:
-            own = sums_of(state, {camera: gated}, together=True)[0]
-            frames = np.array(float(raw.frames))
-            found = found.replace_at(camera, own.change(frames=frames))
+            found = found.replace_at(camera, sums_of(state, {camera: gated}).total())
     return found
 
 
