@@ -15,13 +15,11 @@ from calibgraph.model.clock import at_pixels
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import retract_all, twists_between
-from calibgraph.model.pose_kernel import logarithms
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.parallel import map_on_cores
 from calibgraph.solver.pnp import (
     COARSE,
     Runs,
-    fit_frames,
     frame_pose,
     pose_near_guess,
     ransac_pnp,
@@ -29,6 +27,7 @@ from calibgraph.solver.pnp import (
 )
 from calibgraph.solver.preprocess import frame_edges
 from factors import ProjectionBlock, to_runs
+from factors.pose_kernel import logarithms
 
 _OUTLIER = 6.0  # median distances, 9 sigma of a Gaussian in three dimensions
 COMMON_SAMPLE = 1000
@@ -120,7 +119,7 @@ def _from_common_pose(
     for start_of in (pose_near_guess, ransac_pnp):
         if found.all() or (start := start_of(camera, sample, config)) is None:
             break
-        near, *_ = fit_frames(wide, runs, np.tile(start, (len(runs), 1, 1)), tolerance=COARSE)
+        near, *_ = wide.fit(start[None], runs, tolerance=COARSE)
         poses, found, inliers = refine_frames(block, runs, near, config)
         found &= inliers - 3 > (runs[:, 1] - runs[:, 0]) / 2
     return poses, found

@@ -6,7 +6,6 @@ import numpy as np
 
 from calibgraph.arrays import Array
 from calibgraph.model.geometry import invert_each, local_coordinates, retract_all, to_T_lidar_camera
-from calibgraph.model.pose_kernel import logarithms
 from calibgraph.solver.robust import median_norm, robust_spread, scale_from
 from calibgraph.solver.within_place import WEAK
 from calibgraph.tracking.absorption import add_to_totals, count_epoch
@@ -17,6 +16,7 @@ from calibgraph.tracking.moves import report_drift, select_walk, shift_between, 
 from calibgraph.tracking.state import STRENGTHS, State
 from calibgraph.tracking.sums import Numbers, Sums
 from factors import to_runs
+from factors.pose_kernel import logarithms
 
 _GATE_STEPS = 4  # by the Hessian by weights, which descend: each leaves a third of the way
 
@@ -126,7 +126,7 @@ def _regate(state: State, camera: int, places: Numbers) -> None:
     steps = _linearized_at(state, camera, epochs, places[rows])
     poses = retract_all(np.tile(state.references[camera], (len(steps), 1, 1)), steps)
     runs = to_runs(np.concatenate([[0], counts.cumsum()]))
-    here = raw.with_scale(scale).select(within).run_sums(poses, runs)
+    here = raw.with_scale(scale).select(within).summarize(poses, runs)
     sums = frame_sums(here, state.curvature[camera], -steps, counts.astype(np.float64))
     state.put(camera, blocks=(raw,), inliers=(within,))
     state.sums = state.sums.replace_at((rows, camera), sums)

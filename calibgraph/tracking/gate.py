@@ -11,7 +11,6 @@ from calibgraph.arrays import Array, Mask
 from calibgraph.graph.objective import projection_graph
 from calibgraph.model.config import Config
 from calibgraph.model.geometry import invert_each
-from calibgraph.model.pose_kernel import logarithms
 from calibgraph.solver.matches import MIN_MATCHES, CameraBlock
 from calibgraph.solver.pnp import frame_pose
 from calibgraph.solver.robust import ResidualScale
@@ -20,7 +19,7 @@ from calibgraph.solver.within_place import WEAK
 from calibgraph.tracking.state import OutlierFrame, State
 from calibgraph.tracking.sums import Sums
 from factors import BlockSums, to_runs
-from factors.arrays import unpack_sums
+from factors.pose_kernel import logarithms
 
 _AGREEMENT = 0.7
 """A frame agrees with an estimate that explains this share of the usual share of its matches."""
@@ -97,12 +96,12 @@ def sums_of(state: State, gated: Mapping[int, Gated], *, together: bool = False)
         gated: by camera; linearized where they are gated.
         together: whether all frames of a camera are one.
     """
-    packed, counts, cameras = [], [], list[int]()
+    parts, counts, cameras = [], [], list[int]()
     for camera, one in gated.items():
         own = np.array([one.counts.sum()]) if together else one.counts
         edges = np.concatenate([[0], own.cumsum().astype(np.int64)])
         block = one.raw.with_scale(state.scales[camera]).select(one.inliers)
-        packed.append(block.packed_run_sums(one.T_camera_lidar[None], to_runs(edges)))
+        parts.append(block.summarize(one.T_camera_lidar[None], to_runs(edges)))
         counts.append(own)
         cameras += [camera] * len(own)
     at, to = np.array([one.T_camera_lidar for one in gated.values()]), state.references[[*gated]]
@@ -110,8 +109,7 @@ def sums_of(state: State, gated: Mapping[int, Gated], *, together: bool = False)
     if not np.array_equal(at, to):
         steps = logarithms(at @ invert_each(to))
     step = steps.repeat([*map(len, counts)], axis=0)
-    here = unpack_sums(np.concatenate(packed))
-    return frame_sums(here, state.curvature[cameras], step, np.concatenate(counts))
+    return frame_sums(BlockSums.join(parts), state.curvature[cameras], step, np.concatenate(counts))
 
 
 def frame_sums(here: BlockSums, curvature: Array, steps: Array, matches: Array) -> Sums:
