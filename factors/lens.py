@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from factors.arrays import contiguous
 from factors.kernel import COLUMNS, RESIDUALS, pass_over
-from factors.lens_kernels import FISHEYE, LIMIT, OMNIDIRECTIONAL, PINHOLE
+from factors.lens_kernels import FISHEYE, OMNIDIRECTIONAL, PINHOLE
 
 Array = NDArray[np.float64]
 LensModel = Literal["pinhole", "fisheye", "omnidirectional"]
@@ -87,29 +87,28 @@ class Lens:
         return Lens(kind, np.array(packed, dtype=np.float64))
 
     @property
-    def is_undistorted_pinhole(self) -> bool:
-        """Whether its pixels are linear in x/z and y/z; it has no limit then."""
-        return self.kind == PINHOLE and math.isinf(self.packed[LIMIT])
-
-    @property
     def pixels_per_rad(self) -> float:
         """Resolution along u on the camera's axis [px/rad]."""
         fx = float(self.packed[0])
         return fx / (1.0 + float(self.packed[4])) if self.kind == OMNIDIRECTIONAL else fx
 
-    def project(self, points_camera_m: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:
+    def project(
+        self, points_m: ArrayLike, T_camera_points: Array | None = None
+    ) -> tuple[Array, NDArray[np.bool_]]:
         """Project points.
 
         Args:
-            points_camera_m: (n, 3) in the camera frame.
+            points_m: (n, 3).
+            T_camera_points: (4, 4) of their frame; None: they are in the camera frame.
 
         Returns:
             (n, 2) pixels, and (n,) whether each is a real projection (in front of the camera and
             inside the injective domain of the lens). It may still lie outside the image.
         """
-        columns = _columns(points_camera_m)
+        columns = _columns(points_m)
+        T = _IDENTITY if T_camera_points is None else T_camera_points[None]
         pixels, valid = np.empty((columns.shape[1], 2)), np.empty(columns.shape[1], np.bool_)
-        pass_over(self.kind, self.packed, _IDENTITY, columns, RESIDUALS, pixels, flags=valid)
+        pass_over(self.kind, self.packed, T, columns, RESIDUALS, pixels, flags=valid)
         return pixels, valid
 
     def project_with_jacobian(self, points_camera_m: ArrayLike) -> tuple[Array, Array]:
@@ -120,9 +119,9 @@ class Lens:
         return found[6].T, -found[3:6].T
 
 
-def _columns(points_camera_m: ArrayLike) -> Array:
+def _columns(points_m: ArrayLike) -> Array:
     """(5, n) columns of points at the pixel (0, 0)."""
-    points = np.asarray(points_camera_m, dtype=np.float64).reshape(-1, 3)
+    points = np.asarray(points_m, dtype=np.float64).reshape(-1, 3)
     columns = np.zeros((5, len(points)))
     columns[:3] = points.T
     return contiguous(columns)

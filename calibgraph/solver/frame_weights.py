@@ -23,7 +23,13 @@ from calibgraph.model.geometry import invert, local_coordinates, retract_all
 from calibgraph.parallel import map_on_cores
 from calibgraph.solver.matches import CameraBlock
 from calibgraph.solver.pnp import DAMPING
-from calibgraph.solver.robust import CAUCHY_SCALE_SIGMAS, CUT, robust_spread, robust_spreads
+from calibgraph.solver.robust import (
+    CAUCHY_SCALE_SIGMAS,
+    CUT,
+    MIN_SIGMA_PX,
+    robust_spread,
+    robust_spreads,
+)
 from calibgraph.solver.stage1 import Stage1
 from calibgraph.solver.two_pass import USING_CORRESPONDENCES
 from factors import to_runs
@@ -78,13 +84,15 @@ class FrameFits:
         return 6 * self.spreads**2 / self.counts
 
 
-def fit_each_frame(block: CameraBlock, own: Array, common: Array) -> FrameFits:
-    """Fit every frame alone by damped Gauss-Newton steps, its loss as wide as its residuals spread.
+def fit_each_frame(block: CameraBlock, own: Array, common: Array, *, most_px: float) -> FrameFits:
+    """Fit every frame alone, its loss as wide as its residuals spread.
 
     Args:
         block: of one camera.
         own: (f, 4, 4) T_camera_lidar of its frames, by PnP of each.
         common: (4, 4) T_camera_lidar that a frame starts from if its own fits worse.
+        most_px: spread of a frame's residuals, beyond which none of its matches are good, so that a
+            fit would lead anywhere: it stays where it starts.
     """
     runs, counts = to_runs(block.frame_edges), block.frame_counts
     least = block.least_spreads(runs)
@@ -94,12 +102,14 @@ def fit_each_frame(block: CameraBlock, own: Array, common: Array) -> FrameFits:
 
     tried = np.stack([own, np.broadcast_to(common, own.shape)])
     found = [robust_spreads(block.all_sizes(T, runs)[1], runs) for T in tried]
-    better = found[0] <= found[1]
-    T: Array = np.where(better[:, None, None], tried[0], tried[1])
-    spreads = bounded(np.where(better, found[0], found[1]))
+    better = (found[0] <= found[1])[:, None, None]
+    T: Array = np.where(better, tried[0], tried[1])
+    spreads = bounded(np.minimum(found[0], found[1]))
+    is_fitted = spreads * MIN_SIGMA_PX < most_px * least
     for _ in range(_OWN_FITS):
         scales, before = CAUCHY_SCALE_SIGMAS * spreads, spreads
-        T, sums, _ = block.block.fit(T, runs, scales, tolerance=_OWN_TOLERANCE)
+        moved, sums, _ = block.block.fit(T, runs, scales, tolerance=_OWN_TOLERANCE)
+        T = np.where(is_fitted[:, None, None], moved, T)
         sizes_px, sizes = block.all_sizes(T, runs)
         spreads = bounded(robust_spreads(sizes, runs))
         if np.abs(spreads / before - 1.0).max() < _SETTLED:
@@ -156,6 +166,7 @@ def weigh_all_frames(
             table.of_camera(name).confidence.astype(np.float64),
             start[name],
             stage1[name].by_frame if name in stage1 else {},
+            most_px=config.pnp_threshold_px,
         )
 
     return dict(zip(blocks, map_on_cores(weigh, [*blocks]), strict=True))
@@ -166,6 +177,8 @@ def weigh_frames(
     confidence: Array,
     T_camera_lidar: Array,
     by_frame: Mapping[int, Array],
+    *,
+    most_px: float,
 ) -> tuple[CameraBlock, Array, int]:
     """Weigh the correspondences of one camera by the residuals of its frames and confidences.
 
@@ -174,6 +187,7 @@ def weigh_frames(
         confidence: (n,) of its correspondences.
         T_camera_lidar: (4, 4) where to start; it may be that of a wrong majority of frames.
         by_frame: (4, 4) T_camera_lidar of single frames, by PnP.
+        most_px: as of :func:`fit_each_frame`.
 
     Returns:
         The correspondences without those of outlier frames; (4, 4) T_camera_lidar where the frames
@@ -184,7 +198,7 @@ def weigh_frames(
         return block, T_camera_lidar, 0
     numbers = block.frame[edges[:-1]]
     own = np.array([by_frame.get(number, T_camera_lidar) for number in numbers.tolist()])
-    frames = fit_each_frame(block, own, T_camera_lidar)
+    frames = fit_each_frame(block, own, T_camera_lidar, most_px=most_px)
     sigmas = confidence_sigmas(frames.sizes, confidence)
     start = densest_start(block, frames, T_camera_lidar)
     T_consensus, weights = find_consensus(frames, start)

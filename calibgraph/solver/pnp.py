@@ -1,5 +1,6 @@
 """Robust poses of frames of one camera: many at once over stacked sums, and of one by MAGSAC."""
 
+from collections.abc import Sequence
 from itertools import product
 
 import cv2
@@ -21,22 +22,28 @@ Runs = NDArray[np.int64]
 
 DAMPING = 1e-6
 """Of the diagonal, for frames that leave a direction free."""
-FINE, COARSE = 1e-10, 1e-3
+FINE, COARSE = 1e-6, 1e-3
 """Relative decrease of the cost at which a fit stops: at the optimum; as a start for another."""
 _MIN_INLIER_SHARE = 0.1  # chosen, not measured
 _MIN_SCALED_EIGENVALUE = 1e-9  # below it a direction is free: points on one line, or in one place
 
 
 def refine_frames(
-    block: ProjectionBlock, runs: Runs, T_camera_lidar: Array, config: Config
+    block: ProjectionBlock,
+    runs: Runs,
+    T_camera_lidar: Array,
+    config: Config,
+    *,
+    tolerances: Sequence[float] = (COARSE, FINE),
 ) -> tuple[Array, NDArray[np.bool_], NDArray[np.int64]]:
-    """Re-select each frame's inliers with the full lens model and refine on them, a few times.
+    """Re-select each frame's inliers with the full lens model and refine on them.
 
     Args:
         block: of all frames, with all their matches, unweighted.
         runs: (f, 2) those of each frame, one behind the other.
         T_camera_lidar: (f, 4, 4) starts.
         config: ``pnp_threshold_px``.
+        tolerances: of each fit; by default one with the inliers of PnP, and one with those of it.
 
     Returns:
         (f, 4, 4) poses; (f,) whether enough matches agree on each, and leave no direction of it
@@ -44,7 +51,7 @@ def refine_frames(
     """
     least = np.maximum(MIN_MATCHES, _MIN_INLIER_SHARE * (runs[:, 1] - runs[:, 0]))
     found = np.ones(len(runs), dtype=np.bool_)
-    for tolerance in (COARSE, FINE):  # with the inliers of PnP, then with those of the first
+    for tolerance in tolerances:
         residuals, projectable = block.residuals(T_camera_lidar, runs)
         squared = residuals[:, 0] ** 2 + residuals[:, 1] ** 2
         inlier = projectable & (squared < config.pnp_threshold_px**2)
