@@ -146,11 +146,11 @@ class LensTerm:
     by_distortion: Array
     compensating: Array
 
-    def shifts(self, number: int, *, is_distorted: bool) -> dict[int, Array]:
-        """By key, the (6, ...) displacements of m_c by l_c, s_c and the scan distortion."""
+    def displace(self, number: int, shifts: Mapping[int, Array]) -> dict[int, Array]:
+        """By key, the (6, ...) displacements of m_c, with those by l_c and s_c."""
         B = self.compensating
-        lens = {lens_key(number): -B, seen_lens_key(number): B}
-        return lens | ({DISTORTION: -B @ self.by_distortion} if is_distorted else {})
+        bent = {key: shift - B @ self.by_distortion for key, shift in shifts.items()}
+        return {lens_key(number): -B, seen_lens_key(number): B, **bent}
 
 
 def lens_graph(lenses: Mapping[int, LensTerm], *, is_distorted: bool) -> gtsam.NonlinearFactorGraph:

@@ -88,9 +88,6 @@ simulate street --beams 3 --out never | 3 beams
 simulate kitti --frames 0 --out never | 0 frames: expected 1 to
 simulate walkley --rotation-deg 200 --out never | expected an angle within
 simulate kitti --beams 16 --rig fisheye --out never | --rig and --beams would change nothing
-track rig.yaml table.parquet --motion scans | --motion goes with --matcher only
-track rig.yaml table.parquet --weights a.tar | --weights goes with --matcher only
-track rig.yaml table.parquet table.parquet | several go with --matcher only
 weights bad.tar | bad.tar
 """
 CONFIGS = {

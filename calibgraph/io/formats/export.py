@@ -17,13 +17,14 @@ import cv2
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.errors import CalibrationError, FileError, in_words
+from calibgraph.errors import CalibrationError, FileError
 from calibgraph.files import read_yaml, require_new_file, write_text
 from calibgraph.io.calibrations import is_calibration, load_calibration
 from calibgraph.io.formats import EXPORT_FORMATS
 from calibgraph.io.formats.foreign_keys import DERIVED
+from calibgraph.io.formats.rig_import import read_autoware
 from calibgraph.io.kitti import CALIBRATION_NAME
-from calibgraph.io.rig_parts import Link, frame_id, pose_of_angles, quaternion_xyzw, roll_pitch_yaw
+from calibgraph.io.rig_parts import Link, frame_id, quaternion_xyzw, roll_pitch_yaw
 from calibgraph.io.rigs import load_rig, rig_file
 from calibgraph.model.calibration import FRAMES_SENTENCE, Calibration
 from calibgraph.model.geometry import (
@@ -174,14 +175,9 @@ def carried_coefficients(name: str, camera: Camera, most: int, what: str) -> lis
     return padded[:most]
 
 
-def commented(lines: Iterable[str]) -> str:
-    """Lines as a comment of YAML and of shells."""
-    return "".join(f"# {line}\n" for line in lines)
-
-
 def commented_yaml(statement: Iterable[str], content: dict[str, Any]) -> str:
     """YAML below its statement of direction."""
-    return commented(statement) + yaml_text(content)
+    return "".join(f"# {line}\n" for line in statement) + yaml_text(content)
 
 
 def commented_xml(statement: Iterable[str], root: ElementTree.Element) -> str:
@@ -317,15 +313,9 @@ def read_kit(path: Path) -> dict[str, Array]:
     Raises:
         FileError: if it has none, or one is malformed.
     """
-    found = dict[str, Array]()
-    try:
-        for name, row in read_yaml(path)[_KIT].items():
-            values = [float(row[key]) for key in _ANGLES]
-            found[name] = pose_of_angles(values[:3], values[3:])
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise FileError(
-            path, f"is no {_KIT} with rows of {', '.join(_ANGLES)}: {in_words(error)}"
-        ) from None
+    links = read_autoware(read_yaml(path), path).links
+    if not (found := {each.child: each.T_parent_child for each in links if each.parent == _KIT}):
+        raise FileError(path, f"has no rows of {_KIT}; name the sensor_kit_calibration.yaml")
     return found
 
 
