@@ -29,7 +29,7 @@ from calibgraph.io.bags.stamps import (
     read_messages,
 )
 from calibgraph.io.bags.storage import ODOMETRY, BagOptions, Motion
-from calibgraph.io.bags.topics import RigTopics, choose_topics
+from calibgraph.io.bags.topics import RigTopics, choose_topics, is_rectified
 from calibgraph.io.bags.transforms import (
     MOVING,
     Transforms,
@@ -250,15 +250,16 @@ def _read(
 ) -> tuple[dict[str, TopicStamps], Counter[str]]:
     """The stamps of clouds and images by topic, and how many lenses of a camera are other ones."""
     stamps = {t: TopicStamps() for t in (topics.lidar, *topics.paired.values())}
-    infos = {c.info: (n, c) for n, c in topics.cameras.items() if c.info and bag.has(c.info)}
+    infos = {info: name for name, info in topics.infos.items() if bag.has(info)}
     first, others = dict[str, StatedLens](), Counter[str]()
     for cell, message in read_messages(bag, [*stamps], options.every_s, infos):
         if message.topic in stamps:
             stamps[message.topic].add(message, cell, bag, options.stamps)
             continue
-        name, camera = infos[message.topic]
+        name = infos[message.topic]
         with suppress(FileError):  # some drivers begin with zeros
-            lens = lens_of(message.content, f"{bag.path}", rectified=camera.rectified)
+            rectified = is_rectified(topics.images[name])
+            lens = lens_of(message.content, f"{bag.path}", rectified=rectified)
             others[name] += not lens.agrees(first.setdefault(name, lens))
     return stamps, others
 
@@ -315,7 +316,7 @@ def _summary(
 
 
 def _paired(topics: RigTopics) -> str:
-    kinds = ["images"] * bool(topics.cameras) + ["clouds of other LiDARs"] * bool(topics.lidars)
+    kinds = ["images"] * bool(topics.images) + ["clouds of other LiDARs"] * bool(topics.lidars)
     return " and ".join(kinds)
 
 
