@@ -14,8 +14,8 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from calibgraph.arrays import Array
-from calibgraph.graph.by_place import BlockByPlace
 from calibgraph.graph.components import EXACT
+from calibgraph.graph.latent_poses import BlockByPlace
 from calibgraph.graph.lens import LensTerm, LensVariable
 from calibgraph.graph.variables import lens_key
 from calibgraph.model.config import LensPart, Reported

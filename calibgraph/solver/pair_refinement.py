@@ -29,7 +29,7 @@ from calibgraph.solver.pairs import (
 )
 from calibgraph.solver.places import lengthen
 from calibgraph.solver.pnp import DAMPING
-from calibgraph.solver.two_pass import Objective, Optimum
+from calibgraph.solver.two_pass import RELATIVE_TOLERANCE, Objective, Optimum
 from factors import pose_sigmas
 
 _NARROWINGS = 3  # steps at most from the spread at the estimate to the least one, by half each
@@ -72,7 +72,9 @@ def refine_with_pairs(
         T = near.minimize(T, at.scales, tolerance=_COARSE).T_camera_lidar
     kept = [t.without_outliers(T, s) for t, s in zip(scaled, sigmas.tolist(), strict=True)]
     joined = inliers.with_pairs(kept)
-    return joined, joined.minimize(T, at.scales)
+    goes_on = inliers.config.preset == "auto"  # to the optimum of the error model
+    tolerance = _COARSE if goes_on else RELATIVE_TOLERANCE
+    return joined, joined.minimize(T, at.scales, tolerance=tolerance)
 
 
 def place_pairs(terms: Sequence[PairTerm], T_camera_lidar: Mapping[str, Array]) -> Places:

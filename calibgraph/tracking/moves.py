@@ -23,7 +23,7 @@ import gtsam
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.model.geometry import adjoints, invert, pose_rows, retract_all, to_T_lidar_camera
+from calibgraph.model.geometry import adjoints, invert, pose_rows, retract_all
 from calibgraph.model.pose_kernel import logarithms
 from calibgraph.solver.components import pose_covariance
 from calibgraph.solver.matches import MIN_MATCHES, CameraBlock, merge
@@ -82,10 +82,9 @@ def steps_between(
     if by_places is not None:
         covariance += by_places[np.ix_(rows, rows)]
     limits = alarm_limit(state.total_frames[cameras])
-    references = tuple(map(to_T_lidar_camera, state.references[cameras]))
     apart = np.ravel(ends[1] - ends[0])
     return (
-        Steps(tuple(cameras), apart, covariance, limits, references),
+        Steps(tuple(cameras), apart, covariance, limits, state.references[cameras]),
         dict(zip(cameras, ends[1], strict=True)),
     )
 

@@ -25,10 +25,10 @@ from calibgraph.trust.pose_posterior import (
     PosePosterior,
     group_tied,
     measure_posteriors,
-    measured_pairs,
     widen,
 )
 from calibgraph.trust.probability import probability_beyond
+from factors import pose_sigmas
 
 Checks = Mapping[str, Sequence[Check]]
 """Per camera, its checks; a camera without any may be left out."""
@@ -181,8 +181,13 @@ def _tied(solution: Solution) -> list[tuple[str, ...]]:
     wrong = {(one.pair.a, one.pair.b) for one in known.conflicts if one.largest > limit}
     poses = solution.inliers.rig.relative_poses
     right = [one for one in poses if (one.a, one.b) not in wrong]
-    by_images = [(fit.a, fit.b, fit.covariance) for fit in known.pair_fits]
-    return group_tied(free, [*by_images, *measured_pairs(right)])
+    ties = [(fit.a, fit.b, fit.covariance) for fit in known.pair_fits]
+    for one in right:
+        sigmas = pose_sigmas(
+            rotation_rad=one.rotation_sigma_rad, translation_m=one.translation_sigma_m
+        )
+        ties.append((one.a, one.b, np.diag(sigmas**2)))
+    return group_tied(free, ties)
 
 
 def gather_of_run(run: MatchingRun, *, asks_guess: bool = False) -> Evidence:

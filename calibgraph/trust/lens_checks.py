@@ -38,7 +38,6 @@ from calibgraph.trust.lens_parameter import (
     LensParameter,
     check_parameter,
     lens_variable,
-    units_of,
 )
 from calibgraph.trust.thresholds import limit
 from factors import Columns
@@ -184,19 +183,18 @@ def _check_camera(evidence: Evidence, name: str) -> list[Check]:
     solution, block = evidence.solution.without_pairs(), evidence.fitted_blocks[name]
     camera, places = solution.solved_rig.cameras[name], solution.correspondences.places
     of_place = places.frames_per_place(block.frame_numbers) * evidence.findings.place_variance
-    some = block.select_evenly(_MAX_MATCHES)
+    some, lens = block.select_evenly(_MAX_MATCHES), lens_variable(camera).free
     seen = some.select(np.isfinite(some.all_sizes(camera.T_camera_lidar[None])[0]))
     fit = fit_columns(
         seen,
         camera.T_camera_lidar,
-        lens_variable(camera).free,
+        lens,
         loss_scale=solution.scales[name].loss_scale,
         shared_variance=max(of_place, limit("lens_match_share") * len(some)),
     )
     if fit is None:
         return []
-    units = units_of(camera)
-    freed = _free_each(fit)
+    units, freed = np.array(lens.sigmas), _free_each(fit)
     found = [LensParameter.of(n, units[[*numbers]], freed[n]) for n, numbers in _NUMBERS.items()]
     found = [each.with_error(_OF_RIGHT.get(each.name, 0.0)) for each in found]
     tolerance = solution.config.tolerance
