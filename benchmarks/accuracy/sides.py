@@ -36,8 +36,8 @@ from calibgraph import Intrinsics, Rig, load_rig, perturb
 from calibgraph.simulation.lidar import lidar_of, ring_gains, scan
 from calibgraph.simulation.recording import build_drive
 from calibgraph.simulation.rigs import rig_of
-from calibgraph.simulation.scan_errors import ScanErrors, draw_scan_errors
 from tools.scenes.lens_errors import draw_lens_errors
+from tools.scenes.scan_errors import ScanErrors, draw_scan_errors
 from tools.scenes.sensor_streets import ALIGNMENT, aligned_rig, render
 
 BEAMS = 64

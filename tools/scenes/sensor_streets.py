@@ -20,8 +20,8 @@ from calibgraph import Camera, Intrinsics, Rig, load_dataset, simulate_street
 from calibgraph.model.geometry import to_T_camera_lidar, to_T_lidar_camera, twist_between
 from calibgraph.simulation.lidar import lidar_of
 from calibgraph.simulation.rigs import rig_of
-from calibgraph.simulation.scan_errors import ScanErrors
 from factors import ProjectionBlock, block_factor
+from tools.scenes.scan_errors import ScanErrors
 
 ALIGNMENT = "alignment.yaml"
 _MOST = 20_000  # points of a camera
