@@ -37,6 +37,7 @@ from calibgraph.matching.run import (
     require_known_motion,
     round_in_words,
     summarize_round,
+    with_delays,
     with_motion,
 )
 from calibgraph.matching.same_images import require_different_images
@@ -313,26 +314,28 @@ def with_cameras_of(run: MatchingRun, again: MatchingRun, names: Collection[str]
 
 
 def assign_places(run: MatchingRun) -> MatchingRun:
-    """The run, solved again with the places of its frames.
+    """The run, solved again with the places of its frames, and when its points were taken.
 
-    Where the matcher's error has a part that frames of one place share. The camera with the highest
-    z-score shows where the places are.
+    Places count where the matcher's error has a part that frames of one place share. The camera
+    with the highest z-score shows where they are.
     """
-    findings, solution = run.correspondences.findings, run.solution
+    findings, solution, warnings = run.correspondences.findings, run.solution, run.warnings
     found = {name: z for name, z in findings.z_score.items() if name not in findings.missed}
-    if not findings.place_variance or not found:
-        return run
-    camera, rig, config = max(found, key=lambda n: found[n]), solution.solved_rig, solution.config
+    rig, config = solution.solved_rig, solution.config
     try:
-        groups = find_places(run.dataset, rig, camera, seed=config.seed)
-        up = find_up(run.dataset.frames[0].load_cloud(), rig.T_camera_lidar.values())
+        table = with_delays(run.correspondences, run.dataset)
+        if findings.place_variance and found:
+            camera = max(found, key=lambda name: found[name])
+            groups = find_places(run.dataset, rig, camera, seed=config.seed)
+            table = table.with_places(replace(table.places, places=as_groups(groups)))
+            up = find_up(run.dataset.frames[0].load_cloud(), rig.T_camera_lidar.values())
+            warnings = warnings if up is not None else (*warnings, UNKNOWN_UP)
     except (CalibrationError, OSError):  # the checks on images report it
         return run
-    places = replace(run.correspondences.places, places=as_groups(groups))
-    table, start = run.correspondences.with_places(places), solution.rig.with_lenses_of(run.guess)
-    pairs = solution.camera_matches
+    if table is run.correspondences:
+        return run
+    start, pairs = solution.rig.with_lenses_of(run.guess), solution.camera_matches
     solution = solve_joint(start, table, config, solution.terms, camera_matches=pairs)
-    warnings = run.warnings if up is not None else (*run.warnings, UNKNOWN_UP)
     return replace(run, correspondences=table, solution=solution, warnings=warnings)
 
 

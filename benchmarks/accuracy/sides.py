@@ -4,9 +4,10 @@
     python -m benchmarks.accuracy.sides --summary out/sides.jsonl
 
 A group is a rig with errors of its own and five streets that it drives through, three frames each:
-one place. All kinds have the same images, of one instant, and clouds that differ: ``standing``;
-``swept``, at 10 m/s and not corrected; ``corrected``, the same by the times of its points;
-``one_distance``, standing, with the points alone that are 7 to 12 m away and above the ground.
+one place. Most kinds have the same images, of one instant, and clouds that differ: ``standing``;
+``swept``, at 10 m/s with the times of points, and not corrected; ``corrected``, the same by these
+times; ``one_distance``, standing, with the points alone that are 7 to 12 m away and above the
+ground. Of ``triggered`` the clouds are swept, and each image is taken when the LiDAR looks its way.
 Starts are 2 degrees and 10 cm off. Errors are of the alignment of the cloud that stands.
 """
 
@@ -41,9 +42,10 @@ from tools.scenes.lens_errors import draw_lens_errors
 from tools.scenes.sensor_streets import ALIGNMENT, aligned_rig, render
 
 BEAMS = 64
-TURN_M = 1.0  # driven during a turn: 10 m/s at 10 Hz
-KINDS = "standing", "swept", "corrected", "one_distance"
-SWEPT = "swept", "corrected"
+TURN_S, TURN_M = 0.1, 1.0  # of the LiDAR, at 10 m/s
+START_S = 1_700_000_000  # of stamps
+KINDS = "standing", "swept", "corrected", "one_distance", "triggered"
+SWEPT = "swept", "corrected", "triggered"
 WHERE = {"front": "front", "front_left": "front sides", "front_right": "front sides",
          "back_left": "back sides", "back_right": "back sides", "back": "back"}  # fmt: skip
 
@@ -102,7 +104,10 @@ def run_case(case: Key, scenes: Path) -> Record:
 def _derive(folder: Path, first: Path, still: ScanErrors, case: Key) -> None:
     """The images of the street that is rendered, with other clouds."""
     (folder / "lidar").mkdir(parents=True)
-    (folder / "cameras").symlink_to(os.path.relpath(first / "cameras", folder))
+    if case.kind == "triggered":
+        _render_triggered(folder, still, case)
+    else:
+        (folder / "cameras").symlink_to(os.path.relpath(first / "cameras", folder))
     clouds = [np.load(path) for path in sorted((first / "lidar").glob("*.npy"))]
     if case.kind in SWEPT:
         drive = build_drive(frames=FRAMES, step_m=STEP_M, seed=7000 + case.seed, vary_layout=True)
@@ -112,9 +117,39 @@ def _derive(folder: Path, first: Path, still: ScanErrors, case: Key) -> None:
             scan(drive.world, lidar, gains, T, rng=np.random.default_rng([case.seed, 3, frame]))
             for frame, T in enumerate(drive.T_world_lidar)
         ]
-    change = {"corrected": _at_one_instant, "one_distance": _walls}.get(case.kind, np.asarray)
+    change = {"corrected": _at_one_instant, "one_distance": _walls}.get(case.kind, _with_times)
     for frame, cloud in enumerate(clouds):
-        np.save(folder / "lidar" / f"{frame:06d}.npy", change(cloud))
+        name = f"{START_S + frame}.{0:09d}" if case.kind == "triggered" else f"{frame:06d}"
+        np.save(folder / "lidar" / f"{name}.npy", change(cloud))
+
+
+def _render_triggered(folder: Path, still: ScanErrors, case: Key) -> None:
+    """Images that are taken when the LiDAR looks where their camera looks; stamps name them."""
+    truth, late_s = six_cameras(), {}
+    moved = {}
+    for name, camera in truth.cameras.items():
+        T = camera.T_camera_lidar.copy()
+        heading = np.arctan2(T[2, 1], T[2, 0])
+        late_s[name] = TURN_S * heading / (2 * np.pi)
+        T[:3, 3] -= T[:3, 0] * TURN_M * late_s[name] / TURN_S  # it has driven so far
+        moved[name] = T
+    drive = {"frames": FRAMES, "step_m": STEP_M, "seed": 7000 + case.seed}
+    rendered = folder.with_name("rendered")
+    render(rendered, truth.moved_to(moved), BEAMS, still, **drive)
+    for name, seconds in late_s.items():
+        for frame, image in enumerate(sorted((rendered / "cameras" / name).glob("*"))):
+            stamp_ns = START_S * 10**9 + round((frame + seconds) * 1e9)
+            stamp = f"{stamp_ns // 10**9}.{stamp_ns % 10**9:09d}"
+            there = folder / "cameras" / name / f"{stamp}{image.suffix}"
+            there.parent.mkdir(parents=True, exist_ok=True)
+            image.rename(there)
+
+
+def _with_times(cloud: np.ndarray) -> np.ndarray:
+    """The points of a sweep with their times [s] after the LiDAR looked ahead."""
+    times_s = TURN_S * np.arctan2(cloud[:, 1], cloud[:, 0]) / (2 * np.pi)
+    names = [(name, "f4") for name in ("x", "y", "z", "intensity", "t")]
+    return np.array([*map(tuple, np.column_stack([cloud[:, :4], times_s]))], dtype=names)
 
 
 def _at_one_instant(cloud: np.ndarray) -> np.ndarray:

@@ -275,8 +275,13 @@ class Calibration:
     def not_included(self) -> str:
         """The errors that the bars leave out: relative poses show the clouds' scale."""
         table = self.correspondences
-        moves = table is not None and table.twist_per_s is not None
-        return left_out(self.config, self.rig, has_new_lens=bool(self.lens), motion_known=moves)
+        return left_out(
+            self.config,
+            self.rig,
+            has_new_lens=bool(self.lens),
+            motion_known=table is not None and table.twist_per_s is not None,
+            points_timed=table is not None and table.late_s is not None,
+        )
 
     def error_bar_holds(self, name: str) -> bool:
         """Whether the covariance of a camera or pair "A->B" describes its error.

@@ -30,6 +30,7 @@ from calibgraph.trust.pose_posterior import (
     measured_pairs,
     no_posteriors,
 )
+from calibgraph.trust.probability import probability_beyond
 
 Checks = Mapping[str, Sequence[Check]]
 """Per camera, its checks; a camera without any may be left out."""
@@ -79,8 +80,8 @@ class Evidence:
         tied: the free cameras, in groups that can only be elsewhere together.
         bars: the error bar of the matches beside the posteriors by the images; None where the
             matches determine none.
-        joint_covariance: (6 N, 6 N) of both, the wider one; cameras that are held are unknown by a
-            radian and a metre.
+        joint_covariance: (6 N, 6 N) of both, the wider one, and what an unknown motion of the
+            vehicle does; cameras that are held are unknown by a radian and a metre.
         prior_shares: per camera, which share of its result comes from priors and relative poses.
     """
 
@@ -123,7 +124,11 @@ class Evidence:
         """The probability that its error is beyond the tolerance, by its posterior."""
         if camera in self.solution.held or self.bars is None:
             return 0.0
-        return self.bars.probability_beyond(camera, self.solution.config.tolerance)
+        tolerance = self.solution.config.tolerance
+        by_images = self.bars.probability_beyond(camera, tolerance)
+        if not self.solution.travel.any():
+            return by_images
+        return max(by_images, probability_beyond(self.covariance_of(camera), tolerance))
 
     def covariance_of(self, camera: str) -> Array | None:
         """(6, 6) of one camera, with the error that all the matcher's frames share."""
@@ -146,6 +151,7 @@ class Evidence:
             return {}
         away = np.concatenate([twist_between(mount.T_camera_lidar[name], T[name]) for name in T])
         joint = self.bars.widen(mount.covariance + np.outer(away, away))
+        joint += self.solution.travel @ self.solution.travel.T
         return pair_covariances(joint, T, self.solution.held)
 
 
@@ -171,7 +177,7 @@ def gather(
         rows = {name: pose_rows(number) for number, name in enumerate(cameras)}
         own = {name: known[rows[name], rows[name]] for group in tied for name in group}
         bars = ImagePosteriors(cameras, known, measure(own, tied))
-        joint = bars.widen(known)
+        joint = bars.widen(known) + solution.travel @ solution.travel.T
     return Evidence(solution, guess, excluded, tied, bars, joint, prior_shares(solution))
 
 
