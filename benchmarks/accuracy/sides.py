@@ -7,7 +7,8 @@ A group is a rig with errors of its own and five streets that it drives through,
 one place. Most kinds have the same images, of one instant, and clouds that differ: ``standing``;
 ``swept``, at 10 m/s with the times of points, and not corrected; ``corrected``, the same by these
 times; ``one_distance``, standing, with the points alone that are 7 to 12 m away and above the
-ground. Of ``triggered`` the clouds are swept, and each image is taken when the LiDAR looks its way.
+ground. Of ``triggered`` the clouds are swept, and each image is taken when the LiDAR looks its way;
+``timed`` is the same, with the interval of the clouds given, so that they are corrected.
 Starts are 2 degrees and 10 cm off. Errors are of the alignment of the cloud that stands.
 """
 
@@ -44,8 +45,9 @@ from tools.scenes.sensor_streets import ALIGNMENT, aligned_rig, render
 BEAMS = 64
 TURN_S, TURN_M = 0.1, 1.0  # of the LiDAR, at 10 m/s
 START_S = 1_700_000_000  # of stamps
-KINDS = "standing", "swept", "corrected", "one_distance", "triggered"
+KINDS = "standing", "swept", "corrected", "one_distance", "triggered", "timed"
 SWEPT = "swept", "corrected", "triggered"
+INTERVAL_S = STEP_M * TURN_S / TURN_M  # of the frames
 WHERE = {"front": "front", "front_left": "front sides", "front_right": "front sides",
          "back_left": "back sides", "back_right": "back sides", "back": "back"}  # fmt: skip
 
@@ -97,12 +99,17 @@ def run_case(case: Key, scenes: Path) -> Record:
     for rig, name in ((stated, "reference.yaml"), (aligned, ALIGNMENT)):
         rig.save(folder / name)
     guess = perturb(stated, rotation_deg=2.0, translation_m=0.1, seed=case.seed)
-    result = calibrate_street(folder, guess)
+    result = calibrate_street(folder, guess, interval_s=INTERVAL_S if kind == "timed" else None)
     return ledger.to_record(result, aligned)
 
 
 def _derive(folder: Path, first: Path, still: ScanErrors, case: Key) -> None:
     """The images of the street that is rendered, with other clouds."""
+    if case.kind == "timed":
+        folder.mkdir()
+        for name in ("cameras", "lidar"):
+            (folder / name).symlink_to(f"../triggered/{name}")
+        return
     (folder / "lidar").mkdir(parents=True)
     if case.kind == "triggered":
         _render_triggered(folder, still, case)
@@ -119,7 +126,7 @@ def _derive(folder: Path, first: Path, still: ScanErrors, case: Key) -> None:
         ]
     change = {"corrected": _at_one_instant, "one_distance": _walls}.get(case.kind, _with_times)
     for frame, cloud in enumerate(clouds):
-        name = f"{START_S + frame}.{0:09d}" if case.kind == "triggered" else f"{frame:06d}"
+        name = _stamp(frame, 0.0) if case.kind == "triggered" else f"{frame:06d}"
         np.save(folder / "lidar" / f"{name}.npy", change(cloud))
 
 
@@ -138,11 +145,14 @@ def _render_triggered(folder: Path, still: ScanErrors, case: Key) -> None:
     render(rendered, truth.moved_to(moved), BEAMS, still, **drive)
     for name, seconds in late_s.items():
         for frame, image in enumerate(sorted((rendered / "cameras" / name).glob("*"))):
-            stamp_ns = START_S * 10**9 + round((frame + seconds) * 1e9)
-            stamp = f"{stamp_ns // 10**9}.{stamp_ns % 10**9:09d}"
-            there = folder / "cameras" / name / f"{stamp}{image.suffix}"
+            there = folder / "cameras" / name / f"{_stamp(frame, seconds)}{image.suffix}"
             there.parent.mkdir(parents=True, exist_ok=True)
             image.rename(there)
+
+
+def _stamp(frame: int, late_s: float) -> str:
+    stamp_ns = START_S * 10**9 + round((frame * INTERVAL_S + late_s) * 1e9)
+    return f"{stamp_ns // 10**9}.{stamp_ns % 10**9:09d}"
 
 
 def _with_times(cloud: np.ndarray) -> np.ndarray:

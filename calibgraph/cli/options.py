@@ -194,7 +194,8 @@ IntervalS = Annotated[
     Option(
         metavar="SECONDS",
         help="Time between neighbouring clouds of a folder: the motion of the LiDAR is found by "
-        "their registration. For --estimate offset or readout. (default: unknown)",
+        "their registration. For --estimate offset or readout, and to correct clouds whose points "
+        "have times. (default: unknown)",
     ),
 ]
 MatcherName = Annotated[

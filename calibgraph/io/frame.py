@@ -201,6 +201,9 @@ class Frame:
             found = with_intensity(load_bag_cloud(path, motion.correct if motion else None))
         else:
             found = self.arrays[path] if path in self.arrays else load_cloud(path, self.columns)
+            times_s = None if motion is None else self.load_recorded("", timed=True)[1]
+            if motion is not None and times_s is not None:
+                found[:, :3] = motion.correct(found[:, :3], times_s)
         return thin_cloud(found)
 
     def load_recorded(self, lidar: str, *, timed: bool) -> tuple[Array, Array | None]:
@@ -235,7 +238,8 @@ class Frame:
         """By how much an image is after the stamp, as their names or messages have it."""
         if camera in self.images_after_s:
             return self.images_after_s[camera]
-        taken_ns, stamp_ns = stamp_ns_in_name(self.image_paths[camera].stem), self.stamp_ns
+        path, stamp_ns = self.image_paths.get(camera), self.stamp_ns
+        taken_ns = None if path is None else stamp_ns_in_name(path.stem)
         return None if taken_ns is None or stamp_ns is None else (taken_ns - stamp_ns) / 1e9
 
     def describe_cloud(self) -> list[str]:
@@ -304,7 +308,7 @@ class Frame:
         if self.columns is not None:
             files[_COLUMNS] = list(self.columns)
         motion = self.motion
-        if self.find_twist is not None:
+        if motion is None and self.find_twist is not None:
             motion = ScanMotion(tuple(np.asarray(self.twist_per_s).tolist()), 0.0)
         if motion is not None:
             files[_MOTION] = {"twist_per_s": list(motion.twist_per_s), "to_s": motion.to_s}

@@ -77,15 +77,14 @@ def odd_motions(table: Correspondences) -> list[str]:
 def motion_of(camera: Camera, rows: Correspondences) -> Array | None:
     """(n, 7) the LiDAR's twists, and when the pixels were taken after the points [s].
 
-    None of points of one instant while the motion is unknown; where times alone are known, the
-    twists are zero.
+    None of points of one instant while the motion is unknown. Where the delays of points alone are
+    known, the twists are zero, and times of the rig are not used.
     """
-    if rows.twist_per_s is None and rows.late_s is None:
-        return None
-    times_s = clock_of(camera).times_s(rows.pixels_px[:, 1])
-    times_s -= 0.0 if rows.late_s is None else rows.late_s
-    twists = np.zeros((len(rows), 6)) if rows.twist_per_s is None else rows.twist_per_s
-    return np.column_stack([twists, times_s])
+    late_s = np.zeros(len(rows)) if rows.late_s is None else rows.late_s
+    if rows.twist_per_s is not None:
+        times_s = clock_of(camera).times_s(rows.pixels_px[:, 1])
+        return np.column_stack([rows.twist_per_s, times_s - late_s])
+    return None if rows.late_s is None else np.column_stack([np.zeros((len(rows), 6)), -late_s])
 
 
 def at_pixels(camera: Camera, rows: Correspondences) -> Correspondences:

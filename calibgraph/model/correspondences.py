@@ -191,6 +191,14 @@ class Correspondences:
         return self.select(~np.isin(self.camera_index, left_out)) if left_out else self
 
     @property
+    def is_swept(self) -> bool:
+        """Whether points and pixels are apart in time while the motion is unknown.
+
+        A lens or clock can then not be told from the motion.
+        """
+        return self.twist_per_s is None and self.late_s is not None and bool(self.late_s.any())
+
+    @property
     def matcher(self) -> str:
         """The name of the matcher; empty if the table does not state it."""
         name = self.metadata.get("matcher")

@@ -137,7 +137,7 @@ def travel_errors(at: FittedObjective) -> Array:
     """
     found = np.zeros((len(at.cameras), 6, len(_TRAVEL)))
     for name, block in at.projections.items():
-        if block.motion is None or block.motion[:, :6].any() or not block.motion[:, 6].any():
+        if block.motion is None or block.motion[:, :6].any():
             continue  # of one instant, or moved to the time of the pixels
         shift, T = Columns(block.lens, (OFFSET,), (1.0,)), at.T_camera_lidar[name][None]
         for column, twist in zip(found[at.cameras.index(name)].T, _TRAVEL, strict=True):

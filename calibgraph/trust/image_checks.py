@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 from calibgraph.errors import CalibrationError
 from calibgraph.io.dataset import Dataset
@@ -64,6 +65,8 @@ def check_images(
     evidence = measure_image_evidence(
         dataset, Rig(cameras=cameras), places=table.places, seed=seed, progress=progress
     )
+    if table.is_swept:
+        evidence = {name: replace(found, lens=()) for name, found in evidence.items()}
     of_time = {name: pairing_checks(found) for name, found in evidence.items()}
     names = {frame.index: frame.name for frame in dataset.frames}
     row = threshold("displaced_z_score")

@@ -70,7 +70,7 @@ def image_offset_checks(run: MatchingRun) -> Checks:
     By a matcher made for them, since that of the run has been released.
     """
     config = run.solution.config
-    if not asks_offset(run):
+    if not asks_offset(run) or run.correspondences.is_swept:
         return {}
     rig, moved, registered = run.solution.without_pairs().solved_rig, None, False
     with suppress(CalibrationError, OSError):  # the checks on images report it
@@ -178,6 +178,7 @@ def intrinsics_checks(evidence: Evidence) -> Checks:
     """
     cameras = evidence.solution.without_pairs().solved_rig.cameras
     names = [n for n in evidence.fitted_blocks if cameras[n].model != "equirectangular"]
+    names = [] if evidence.solution.correspondences.is_swept else names
     checks = map_on_cores(lambda name: _check_camera(evidence, name), names)
     return dict(zip(names, checks, strict=True))
 

@@ -22,6 +22,7 @@ from calibgraph.model.geometry import twist_between
 from calibgraph.model.verdict import TOLERANCE
 from calibgraph.solver.joint import solve_joint
 from calibgraph.trust.evidence import gather
+from calibgraph.trust.lens_checks import intrinsics_checks
 from factors import Clock, displace
 from tests.draws.clocks import draw_twists, put_clock_error
 from tests.draws.lenses import put_lens_error
@@ -58,6 +59,7 @@ def test_what_an_unknown_motion_does_to_a_sweep_is_in_the_bar(
     still = gather(solve_joint(truth, replace(table, late_s=np.zeros(len(table)))), truth)
     found = gather(solve_joint(truth, replace(table, points_lidar_m=swept, late_s=late_s)), truth)
     assert not still.solution.travel.any()
+    assert intrinsics_checks(still) and not intrinsics_checks(found)  # a sweep looks like a lens
     moved = np.concatenate([
         twist_between(found.solution.T_camera_lidar[name], still.solution.T_camera_lidar[name])
         for name in truth.cameras
