@@ -201,7 +201,7 @@ IntervalS = Annotated[
 MatcherName = Annotated[
     str, Option(metavar="NAME|FILE", help="structure, cmrnext, or a table of correspondences.")
 ]
-_WEIGHTS = "Networks of cmrnext, .tar or .safetensors; repeat it in the order in which they run."
+_WEIGHTS = "Networks of cmrnext (iter1.tar); repeat it in the order in which they run."
 Weights = Annotated[list[Path] | None, Option(metavar="FILE", help=_WEIGHTS)]
 TimeLimitS = Annotated[
     float | None,

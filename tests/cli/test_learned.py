@@ -1,8 +1,7 @@
-"""The command `weights`, and `calibrate` with the matcher cmrnext."""
+"""`calibrate` with the matcher cmrnext."""
 
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
 
@@ -20,16 +19,6 @@ from tests.matching.cmrnext.builders import good_content, saved
 def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An untrained network."""
     return saved(tmp_path_factory.mktemp("weights") / "random.tar", good_content())
-
-
-def test_weights_are_checked_and_converted(weights: Path, tmp_path: Path, call: Call) -> None:
-    converted = tmp_path / "good.safetensors"
-    assert call("weights", weights, "--out", converted)[0] == 0
-    code, _, line = call("weights", converted, "--out", converted)
-    assert code == 2 and "is there already" in line
-    described = json.loads(call("weights", converted, "--json")[1])
-    assert described["network"]["fourier_levels"] == 12
-    assert described["config"]["max_r"] == 1.0
 
 
 def test_rare_settings_are_read_from_a_file(tmp_path: Path) -> None:
@@ -73,6 +62,6 @@ def test_missing_torch_is_reported_in_one_line(call: Call, monkeypatch: pytest.M
         if name.startswith("calibgraph.matching.cmrnext"):
             monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "torch", None)
-    code, _, line = call("weights", "iter1.tar")
+    code, _, line = call("match", SAMPLE, "--matcher", "cmrnext", "--weights", "iter1.tar")
     assert code == 2
     assert "pip install 'calibgraph[learned]'" in line and line.count("\n") == 1
