@@ -23,7 +23,7 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_rare_settings_are_read_from_a_file(tmp_path: Path) -> None:
     values = {"stamps": "record", "sync_tolerance_s": 0.1, "device": "cpu",
-              "iterations": 2, "half_resolution": True, "batch": 3, "terms": "stage1"}  # fmt: skip
+              "iterations": 2, "half_resolution": True, "terms": "stage1"}  # fmt: skip
     assert values.keys() == RareSettings.model_fields.keys()
     config = tmp_path / "config.yaml"
     config.write_text(yaml.safe_dump(values))
