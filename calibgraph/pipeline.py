@@ -219,7 +219,6 @@ def to_calibration(evidence: Evidence, checks: RunChecks) -> Calibration:
         weaknesses=Later(
             lambda: {n: weaknesses(solution, n, evidence.covariance_by_matches(n)) for n in cameras}
         ),
-        prior_share=evidence.prior_shares,
         error_sources=Later(lambda: evidence.error_sources),
         lens=solution.lens,
         lens_covariance=_with_poses(solution.lens_covariance, evidence),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from shlex import join
@@ -22,40 +21,24 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-_PAGES = (".html", ".htm")
-
-
 def report(
     result: Path = Argument(..., metavar="RESULT", help="Its folder, or its calibration.yaml."),
     out: Path | None = Option(
-        None, metavar="FILE.html", help="Page. (default: report.html beside, or none with --mcap)"
+        None, metavar="FILE.html", help="Page. (default: report.html beside the result)"
     ),
-    mcap: Path | None = Option(None, metavar="FILE.mcap", help="Recording for Foxglove or Rerun."),
     force: options.Force = False,
 ) -> None:
-    """Show a result: as one HTML page that opens without a network, or as a recording.
-
-    The recording shows clouds, images and projected points, before and after.
-    """
+    """Show a result as one HTML page that opens without a network."""
     from calibgraph.files import require_new_file
     from calibgraph.io.calibrations import load_calibration
     from calibgraph.model.result_files import REPORT_FILE
     from calibgraph.report.html import write_report
 
-    for path, suffixes in ((out, _PAGES), (mcap, (".mcap",))):
-        if path is not None:
-            require_new_file(path, *suffixes, force=force)
-    loaded, written = load_calibration(result), []
-    if out is not None or mcap is None:
-        folder = result if result.is_dir() else result.parent
-        written.append(write_report(loaded, out or folder / REPORT_FILE))
-    if mcap is not None:
-        from calibgraph.report.mcap_file import write_mcap
-
-        with progress_bar("reading") as progress:
-            written.append(write_mcap(loaded, mcap, progress=progress))
-    for path in written:
-        print_line(f"{path}: written; the verdict is {loaded.verdict.status}")
+    if out is not None:
+        require_new_file(out, ".html", ".htm", force=force)
+    loaded, folder = load_calibration(result), result if result.is_dir() else result.parent
+    path = write_report(loaded, out or folder / REPORT_FILE)
+    print_line(f"{path}: written; the verdict is {loaded.verdict.status}")
 
 
 def evaluate(
@@ -150,20 +133,7 @@ def doctor(
         raise typer.Exit(1)
 
 
-_LIST = "list"
-
-
-def _list_formats(format: str) -> str:
-    """Print the formats for ``--format list``, before other arguments are required."""
-    if format == _LIST:
-        from calibgraph.report.as_json import print_line
-
-        width = max(map(len, EXPORT_FORMATS))
-        lines = (f"{name:{width}}  {meaning}" for name, meaning in EXPORT_FORMATS.items())
-        with suppress(BrokenPipeError):
-            print_line("\n".join(lines))
-        raise typer.Exit
-    return format
+_FORMATS = "; ".join(f"{name}: {meaning}" for name, meaning in EXPORT_FORMATS.items()) + "."
 
 
 def export(
@@ -173,9 +143,7 @@ def export(
     format: str = Option(
         ...,
         metavar="FORMAT",
-        callback=_list_formats,
-        is_eager=True,
-        help=f"{', '.join(EXPORT_FORMATS)}; list: what these are.",
+        help=_FORMATS,
     ),
     out: Path = Option(..., metavar="FILE", help="File to write; of camera_info a folder."),
     camera: list[str] | None = Option(
@@ -269,8 +237,8 @@ def simulate(
         metavar="NAME|RIG",
         rich_help_panel=_PANEL,
         help="kitti, walkley (stereo pairs), surround (six cameras), fisheye (four), omni "
-        "(two that see more than a half-space), panorama (one that sees all round), sample "
-        f"(three small ones), or a rig file; its extrinsics are the truth. (default: {RIG})",
+        "(two that see more than a half-space), sample (three small ones), or a rig file; its "
+        f"extrinsics are the truth. (default: {RIG})",
     ),
     beams: int | None = Option(
         None,

@@ -194,20 +194,13 @@ def _frames_of_files(
     complete: bool, tolerance_s: float, interval_s: float | None,
 ) -> FoundFrames:  # fmt: skip
     """The frames of a folder; the complete ones where names are stamps."""
-    files, pairing = frames_of_folder(
+    found, pairing = frames_of_folder(
         path, [*rig.cameras], lidars=rig.all_lidars, complete=complete, sync_tolerance_s=tolerance_s
     )
     frames = tuple(
-        Frame(
-            start + n,
-            prefix + each.stem,
-            each.cloud,
-            each.images,
-            columns=rig.cloud_columns,
-            lidar_paths=each.lidars,
-        )
-        for n, each in enumerate(files)
-        if not pairing or rig.cameras.keys() <= each.images.keys()
+        replace(each, index=start + n, name=prefix + each.name, columns=rig.cloud_columns)
+        for n, each in enumerate(found)
+        if not pairing or rig.cameras.keys() <= each.image_paths.keys()
     )
     late_s, notes = dict[str, Array](), [pairing] if pairing else []
     if interval_s is not None:

@@ -20,7 +20,6 @@ from calibgraph.model.correspondences import (
     COORDINATES,
     INFORMATION,
     LATE,
-    OPTIONAL_WHOLE,
     TWIST,
     Correspondences,
     as_confidence,
@@ -45,7 +44,8 @@ def load_correspondences(path: Path | str) -> Correspondences:
     """
     path = require_file(Path(path))
     table = read_arrow(path)
-    require_rows(path, len(table))
+    if not len(table):
+        raise FileError(path, "holds no rows; write the correspondences into it")
     try:
         return from_arrow(table)
     except CorrespondenceError as error:
@@ -120,12 +120,6 @@ def arrow_reads(path: Path) -> Iterator[None]:
         raise FileError(path, message) from error
 
 
-def require_rows(path: Path, rows: int) -> None:
-    """Check that a file has rows."""
-    if not rows:
-        raise FileError(path, "holds no rows; write the correspondences into it")
-
-
 def from_arrow(table: pa.Table) -> Correspondences:
     """Build correspondences from an Arrow table that has the file format's columns."""
     import pyarrow as pa
@@ -189,7 +183,7 @@ def _from_plain_columns(table: pa.Table) -> Correspondences:
         information_px=stack(INFORMATION) if INFORMATION[0] in given else None,
         twist_per_s=stack(TWIST) if TWIST[0] in given else None,
         late_s=table[LATE].to_numpy().astype(np.float64) if LATE in given else None,
-        **{name: _whole(table, name) for name in OPTIONAL_WHOLE if name in given},
+        stamp_ns=_whole(table, "stamp_ns") if "stamp_ns" in given else None,
         metadata=json.loads((table.schema.metadata or {}).get(b"matcher", b"{}")),
     )
 

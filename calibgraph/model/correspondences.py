@@ -33,10 +33,10 @@ TWIST_RULE = "be under 6 rad/s, then under 100 m/s (rotation first, in radians)"
 
 MIN_INFORMATION, MAX_INFORMATION = 1e-12, 1e8  # 1/px^2: errors from 1e6 px down to 1e-4 px
 
-OPTIONAL_WHOLE = ("stamp_ns", "point_index")
-_WHOLE = ("frame", *OPTIONAL_WHOLE)
+_WHOLE = ("frame", "stamp_ns")
 _REQUIRED = ("camera", "frame", *COORDINATES)
-_COLUMNS = (*_REQUIRED, "confidence", *OPTIONAL_WHOLE, *INFORMATION, *TWIST, LATE)
+_COLUMNS = (*_REQUIRED, "confidence", "stamp_ns", *INFORMATION, *TWIST, LATE)
+_FORMER = "point_index"  # a column of earlier tables, which is not read
 _TEXT = ("string", "large_string", "string_view", "binary", "large_binary")
 
 WITHOUT_METADATA = (
@@ -64,7 +64,6 @@ class Correspondences:
             [1/px^2], positive semidefinite; it may have rank one (an edge constrains only its
             normal). None stands for the identity.
         stamp_ns: (n,) or None: time of the frame.
-        point_index: (n,) or None: the point's row in its frame's cloud, -1 if it is none of them.
         twist_per_s: (n, 6) or None: of the LiDAR in its axes, rotation [rad/s], translation [m/s].
         late_s: (n,) or None: how long after its pixel a point was taken [s], where clouds are not
             corrected for motion; zero while the vehicle stands. None of clouds of one instant.
@@ -85,7 +84,6 @@ class Correspondences:
     confidence: NDArray[np.float32]
     information_px: Array | None = None
     stamp_ns: NDArray[np.int64] | None = None
-    point_index: NDArray[np.int64] | None = None
     twist_per_s: Array | None = None
     late_s: Array | None = None
     metadata: dict[str, Any] = field(default_factory=dict)
@@ -126,7 +124,6 @@ class Correspondences:
         confidence: ArrayLike | None = None,
         information_px: ArrayLike | None = None,
         stamp_ns: ArrayLike | None = None,
-        point_index: ArrayLike | None = None,
         twist_per_s: ArrayLike | None = None,
         metadata: dict[str, Any] | None = None,
     ) -> Correspondences:
@@ -137,9 +134,8 @@ class Correspondences:
         """
         pixels = np.atleast_2d(np.asarray(pixels_px, dtype=np.float64))
         n = len(pixels)
-        whole = {"frame": frame, "stamp_ns": stamp_ns, "point_index": point_index}
-        for name, numbers in whole.items():
-            check_whole(name, numbers)
+        check_whole("frame", frame)
+        check_whole("stamp_ns", stamp_ns)
         one = isinstance(camera, str) and n > 0  # not sorted, as the names of many rows are
         of_rows = np.asarray([camera] if one else np.broadcast_to(np.asarray(camera), n))
         names, index = np.unique(of_rows, return_inverse=True)
@@ -152,7 +148,6 @@ class Correspondences:
             confidence=as_confidence(np.ones(n) if confidence is None else confidence),
             information_px=_optional(information_px, np.float64),
             stamp_ns=_optional(stamp_ns, np.int64),
-            point_index=_optional(point_index, np.int64),
             twist_per_s=_optional(twist_per_s, np.float64),
             metadata=metadata or {},
         )
@@ -248,8 +243,7 @@ class Correspondences:
             **dict(zip(COORDINATES[2:], self.points_lidar_m.T, strict=True)),
             "confidence": self.confidence,
         }
-        optional = {name: getattr(self, name) for name in OPTIONAL_WHOLE}
-        columns |= {name: column for name, column in optional.items() if column is not None}
+        columns |= {} if self.stamp_ns is None else {"stamp_ns": self.stamp_ns}
         for names, values in ((INFORMATION, self.information_px), (TWIST, self.twist_per_s)):
             columns |= {} if values is None else dict(zip(names, values.T, strict=True))
         columns |= {} if self.late_s is None else {LATE: self.late_s}
@@ -267,8 +261,6 @@ class Correspondences:
             self._require(np.abs(late) < MAX_LATE_S, LATE, late, f"be below {MAX_LATE_S:g} s")
         c = self.confidence
         self._require((c > 0) & (c <= 1), "confidence", c, "lie in (0, 1]")
-        if self.point_index is not None:
-            self._require(self.point_index >= -1, "point_index", self.point_index, "be at least -1")
         if self.information_px is not None:
             i = self.information_px
             good = (np.abs(i) < MAX_INFORMATION).all(axis=1)
@@ -287,7 +279,7 @@ class Correspondences:
 
 _WIDTHS = {
     "camera_index": 1, "frame": 1, "pixels_px": 2, "points_lidar_m": 3, "confidence": 1,
-    "information_px": 3, "stamp_ns": 1, "point_index": 1, "twist_per_s": 6, "late_s": 1,
+    "information_px": 3, "stamp_ns": 1, "twist_per_s": 6, "late_s": 1,
 }  # fmt: skip
 _OTHERS = {"cameras", "metadata", "findings", "places"}
 assert set(_WIDTHS) == {f.name for f in fields(Correspondences)} - _OTHERS
@@ -318,7 +310,7 @@ def concatenate(tables: Sequence[Correspondences]) -> Correspondences:
     if any(table.late_s is not None for table in tables):
         late = [np.zeros(len(t)) if t.late_s is None else t.late_s for t in tables]
         columns[LATE] = np.concatenate(late)
-    for name in ("stamp_ns", "point_index", "twist_per_s"):
+    for name in ("stamp_ns", "twist_per_s"):
         given = [getattr(table, name) for table in tables if len(table)]
         if given and all(column is not None for column in given):
             columns[name] = np.concatenate(given)
@@ -388,7 +380,7 @@ def check_schema(schema: pa.Schema) -> None:
         raise CorrespondenceError(f"a column's name is not UTF-8 ({error}); rename it") from error
     names = [name for name, _ in types]
     missing = [name for name in _REQUIRED if name not in names]
-    unknown = [name for name in names if name not in _COLUMNS]
+    unknown = [name for name in names if name not in (*_COLUMNS, _FORMER)]
     if missing:
         raise CorrespondenceError(f"column {missing[0]!r} is missing; found {names}")
     if unknown:

@@ -21,7 +21,7 @@ from calibgraph.graph.lens import LensTerm, LensVariable
 from calibgraph.graph.variables import lens_key
 from calibgraph.model.config import LensPart, Reported
 from calibgraph.model.findings import MatcherFindings, error_components
-from calibgraph.model.geometry import to_T_camera_lidar, to_T_lidar_camera
+from calibgraph.model.geometry import pose_rows, to_T_camera_lidar, to_T_lidar_camera
 from calibgraph.model.lens import LensEstimate, LensSigmas
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.solver.covariance import FittedObjective, positive_part
@@ -152,7 +152,7 @@ def considered_lens(camera: Camera, block: ProjectionBlock) -> LensVariable:
 
     And of the clock, where the motion of the LiDAR is known.
     """
-    parts: list[LensPart] = [] if camera.model == "equirectangular" else [*_LENS]
+    parts: list[LensPart] = [*_LENS]
     if block.motion is not None and block.motion[:, :6].any():
         parts += ["offset", "readout"] if camera.readout_sigma_s else ["offset"]
     return LensVariable.of(camera, parts, LensSigmas.calibrated(camera))
@@ -254,16 +254,27 @@ def lens_estimates(fit: ErrorFit) -> dict[str, tuple[LensEstimate, ...]]:
     """Per camera whose lens is free, its parameters with their marginal."""
     model, found = fit.model, {}
     for number, term in model.lenses.items():
-        own = [lens_key(number), model.reported_keys[number]]
-        values, covariance = fit.linear.shared.atVector(own[0]), fit.linear.covariance_of(own)
+        values, covariance = (
+            fit.linear.shared.atVector(lens_key(number)),
+            joint_of_lens(fit, number),
+        )
         sigmas = np.sqrt(np.diag(covariance))
-        with_pose = np.abs(covariance / np.outer(sigmas, sigmas))[:, len(values) :]
-        rows = zip(term.variable.free.parameters, sigmas, with_pose, strict=False)
+        with_pose = np.abs(covariance / np.outer(sigmas, sigmas))[6:, :6]
+        rows = zip(term.variable.free.parameters, sigmas[6:], with_pose, strict=True)
         found[model.cameras[number]] = tuple(
             _estimate(term.variable, values, name, sigma, correlations=correlations)
             for name, sigma, correlations in rows
         )
     return found
+
+
+def joint_of_lens(fit: ErrorFit, number: int) -> Array:
+    """(6 + k, 6 + k) covariance of a camera's reported pose and its lens, in their tangents."""
+    own, lens = pose_rows(number), fit.model.columns[lens_key(number)]
+    rows = np.vstack([fit.rows[own], np.eye(fit.model.size)[lens]])
+    joint = rows @ fit.linear.joint_covariance @ rows.T
+    joint[:6, :6] = fit.covariance[own, own]
+    return np.asarray(joint)
 
 
 def lens_covariances(fit: ErrorFit) -> dict[str, Array]:
@@ -274,7 +285,7 @@ def lens_covariances(fit: ErrorFit) -> dict[str, Array]:
     """
     model, found = fit.model, {}
     for number, term in model.lenses.items():
-        joint = fit.linear.covariance_of([model.reported_keys[number], lens_key(number)])
+        joint = joint_of_lens(fit, number)
         units = [_unit(term.variable, name) for name in term.variable.free.parameters]
         scale = np.array([-1.0] * 6 + units)  # of T_lidar_camera the tangent is -xi
         found[model.cameras[number]] = joint * np.outer(scale, scale)

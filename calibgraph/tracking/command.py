@@ -7,24 +7,17 @@ import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import islice
 from pathlib import Path
 from types import FrameType
 
-from calibgraph.errors import CalibrationError, DatasetError, FileError
-from calibgraph.io.bags import BagOptions
-from calibgraph.io.dataset import load_dataset
-from calibgraph.matching.burnt_in import hide_burnt_in
-from calibgraph.matching.protocol import FullMatcher, Matcher
-from calibgraph.matching.same_images import require_different_images
+from calibgraph.errors import CalibrationError, FileError
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.config import Config
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import START
 from calibgraph.report.as_json import print_line, require_stdout
 from calibgraph.tracking.assessment import Update, json_lines
-from calibgraph.tracking.dataset_frames import DatasetDrive
 from calibgraph.tracking.durable import DurableCalibrator
 from calibgraph.tracking.frames import Item, frames_of
 from calibgraph.tracking.tracker import UNSOLVABLE, IncrementalCalibrator, warm_up_tracker
@@ -35,52 +28,22 @@ STATE_FOLDER = "state"
 _TOGETHER = 50  # frames of a table that are taken in by one write
 
 
-def open_drive(
-    source: Sequence[Path], rig: Rig, config: Config, *, matcher: Matcher, every: int = 1,
-    interval_s: float | None = None, bag: BagOptions | None = None,
-) -> DatasetDrive:  # fmt: skip
-    """Dataset folders or bags as one drive.
-
-    Args:
-        source: the folders.
-        rig: the initial guess.
-        config: settings.
-        matcher: of the frames.
-        every: match every so-many-th frame.
-        interval_s: between neighbouring clouds of folders, whose registration shows the motion.
-        bag: how bags are read.
-
-    Raises:
-        CalibrationError: if they cannot be used.
-    """
-    try:
-        data = load_dataset(source, rig, bag=bag, interval_s=interval_s)
-    except ValueError as error:  # of an option: a wrong argument of the user
-        raise DatasetError(str(error)) from error
-    full = FullMatcher(matcher)
-    require_different_images(data, rig)
-    data = hide_burnt_in(replace(data, frames=data.frames[::every]), rig)
-    return DatasetDrive(data, full, config.changed(stage1=full.stage1))
-
-
 def track(
     rig: Rig,
-    source: Sequence[Path],
+    source: str,
     *,
     config: Config,
     out: Path,
     notify: Notify,
-    drive: DatasetDrive | None = None,
 ) -> tuple[Calibration, list[Path]]:
     """Track a source until it ends or a signal comes; a line of JSON per update on stdout.
 
     Args:
         rig: the initial guess.
-        source: a table, or -; the folders of a drive.
+        source: a table, or "-" for standard input.
         config: settings.
         out: folder for the state and the result.
         notify: called with warnings and events as sentences.
-        drive: of which the frames are; None: of the source.
 
     Returns:
         The last estimate; the files written.
@@ -90,27 +53,22 @@ def track(
     """
     require_stdout()
     rig.require_cameras()
-    state, waits = out / STATE_FOLDER, str(source[0]) == "-"  # frames come at their own times
+    state, waits = out / STATE_FOLDER, source == "-"  # frames come at their own times
     with _stopped_by_signals() as stop:
         if waits:
             warm_up_tracker()
-        if drive is None:
-            items: Iterator[Item] = frames_of(str(source[0]))
-            calibrator = DurableCalibrator(state, rig, config)
-        else:
-            begin = partial(_first_rig, drive, rig, notify)
-            calibrator = DurableCalibrator(state, rig, drive.config, begin=begin)
-            items = drive.items(calibrator.tracker)
+        items = frames_of(source)
+        calibrator = DurableCalibrator(state, rig, config)
         if calibrator.resumed:
             notify(f"going on after frame {calibrator.tracker.frame}")
         gc.freeze()  # what is loaded by now stays: each full collection would visit it, for 0.1 s
         run = Run(calibrator, notify)
         with calibrator:
-            run.follow(items, 1 if waits or drive is not None else _TOGETHER, stop)
+            run.follow(items, 1 if waits else _TOGETHER, stop)
             if calibrator.tracker.frame is None and not stop.received:
                 held = f"held no frame that could be used ({run.left_out} left out); check it"
-                raise FileError("standard input" if waits else source[0], held)
-            result = _result(calibrator.tracker, rig, state)
+                raise FileError("standard input" if waits else source, held)
+            result = _result(calibrator.tracker, state)
     run.report_counts()
     return result, [result.save(out)]
 
@@ -182,11 +140,8 @@ class Run:
                 self.notify(f"frame {event.detected_frame}: {event}")
 
 
-def _result(tracker: IncrementalCalibrator, guess: Rig, state: Path) -> Calibration:
-    """That of the guess, not of where the first batch has located it.
-
-    A camera without an estimate fails at the end, as one that `calibrate` does not find.
-    """
+def _result(tracker: IncrementalCalibrator, state: Path) -> Calibration:
+    """The last estimate; a camera without one fails, as one that `calibrate` does not find."""
     try:
         result = tracker.calibration()
     except UNSOLVABLE as error:
@@ -201,16 +156,7 @@ def _result(tracker: IncrementalCalibrator, guess: Rig, state: Path) -> Calibrat
         ))
         for name, one in result.camera_verdicts.items()
     }  # fmt: skip
-    return replace(result, initial_rig=guess, camera_verdicts=verdicts)
-
-
-def _first_rig(drive: DatasetDrive, guess: Rig, notify: Notify) -> Rig:
-    """The guess at the poses of the first frames' batch; a warning if they are not reliable."""
-    verdict = drive.start.verdict
-    if verdict.status == "FAIL":
-        reasons = "; ".join(verdict.reasons)
-        notify(f"warning: the first frames give no reliable start: {reasons}")
-    return guess.moved_to(drive.start.rig.T_camera_lidar)
+    return replace(result, camera_verdicts=verdicts)
 
 
 @dataclass

@@ -284,12 +284,10 @@ class EpochGraph:
             found = own.eliminate(weights, self.window.adjoint)
             information, vector = information + found.information, vector + found.vector
         self.window.exchange(information, vector)
-        keys = self.window.model.reported_keys
-        if state.config.preset == "auto":
-            T = self.window.T_camera_lidar(keys)
-        else:
+        T, covariance = self.window.reported(state.config.of)
+        if state.config.preset != "auto":
             T = retract_all(state.references, self.equation_5(sums))
-        covariance = self.window.covariance(keys) + block_diagonal(state.lens_errors)
+        covariance = covariance + block_diagonal(state.lens_errors)
         few = np.repeat(sums.frames < ENOUGH_FRAMES, 6)
         covariance[few], covariance[:, few] = np.nan, np.nan
         return Estimate(T, covariance, sums, self._conflicts(state, sums), self.window)

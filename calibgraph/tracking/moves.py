@@ -487,7 +487,7 @@ def _restart_camera(
     state.put(
         camera,
         blocks=(), inliers=(), outliers=(), agreements=(), moved_at=state.updates, absent=0,
-        walks=Sums.zeros(len(STRENGTHS)), evidence=0.0, walk=0, ungated=Sums.zeros(),
+        walks=Sums.zeros(len(STRENGTHS)), evidence=0.0, walk=0,
     )  # fmt: skip
     absorb_again(state, camera, blocks, T_camera_lidar)
 

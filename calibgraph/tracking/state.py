@@ -135,7 +135,6 @@ class State:
         walks: (n, 4) sums of older epochs, each discounted by its walk.
         evidence: (n, 4) log-likelihoods of the epochs, forgotten slowly.
         walk: (n,) which of the walks is selected.
-        ungated: (n,) of all matches of older epochs, outliers too: Hessian by weights, gradient.
         groups: (n, 2) number of epochs, and how much these scatter.
         spread: of the frames of closed epochs.
         lens: (6, 6 + k) per camera, of closed epochs, by ``calibgraph.solver.lens.lens_columns``.
@@ -186,7 +185,6 @@ class State:
     walks: Sums
     evidence: Array
     walk: Numbers
-    ungated: Sums
     groups: Array
     spread: Spread
     lens: tuple[Array, ...]
@@ -248,7 +246,6 @@ class State:
             walks=Sums.zeros(n, walks),
             evidence=np.zeros((n, walks)),
             walk=np.zeros(n, np.int64),
-            ungated=Sums.zeros(n),
             groups=np.zeros((n, 2)),
             spread=Spread.unknown(n),
             lens=(np.zeros((6, 6)),) * n,
@@ -399,7 +396,7 @@ class State:
         found = [sums]
         for size, epoch in zip(self.sizes[:-1], of_epochs[:-1], strict=True):
             variance = self.walk_variance(STRENGTHS[self.walk], size)
-            sums = (sums + Sums(epoch)).after_walk(variance, self.overconfidence)[0]
+            sums = (sums + Sums(epoch)).after_walk(variance, self.overconfidence)
             found.append(sums)
         return [*found, sums + Sums(of_epochs[-1])]
 

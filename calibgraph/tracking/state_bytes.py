@@ -32,7 +32,7 @@ from factors import Lens, ProjectionBlock
 
 Kind = TypeVar("Kind")
 
-_MARK = b"calibgraph-tracker/16\n"
+_MARK = b"calibgraph-tracker/17\n"
 _BODY = len(_MARK) + hashlib.sha256().digest_size
 _DTYPES = ("<f8", "<f4", "<i8", "<i4", "|b1")
 

@@ -42,16 +42,13 @@ SOLUTION_CHECKS: tuple[Callable[[Evidence], Checks], ...] = (
     solution_checks.outlier_frame_checks,  # how many frames were left out?
     agreement.place_checks,                # does a place contradict the others?
     solution_checks.repeated_frame_checks, # how many are of one place, or copies?
-    solution_checks.assumed_spread_checks, # does the configured loss scale suit the residuals?
     lens_checks.intrinsics_checks,         # would another lens explain the residuals?
     lens_checks.offset_checks,             # would images of another time?
-    solution_checks.prior_share_checks,    # how much of it comes from the priors?
 )  # fmt: skip
 """Checks of a solution, from correspondences alone; those that name a cause come first."""
 
 RUN_CHECKS: tuple[Callable[[MatchingRun], Checks], ...] = (
     matcher_checks.last_round_checks,      # have the rounds of matching converged?
-    guess.range_checks,                    # is the result within the matcher's range?
     matcher_checks.repeated_file_checks,   # are the frames independent?
     matcher_checks.rematch_checks,         # does matching from a displaced start end here?
     matcher_checks.going_on_checks,        # did the rounds end elsewhere first?

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 
 from calibgraph.errors import CalibrationError
@@ -67,30 +67,11 @@ def check_images(
     )
     if table.is_swept:
         evidence = {name: replace(found, lens=()) for name, found in evidence.items()}
-    of_time = {name: pairing_checks(found) for name, found in evidence.items()}
     names = {frame.index: frame.name for frame in dataset.frames}
-    row = threshold("displaced_z_score")
-    placed = {n for n, found in evidence.items() if row.grade(found.displaced_z_score) != "FAIL"}
-    of_placed = {name: checks for name, checks in of_time.items() if name in placed}
     return {
-        name: (*evidence_checks(found, names, tolerance), *of_time[name])
-        + _clouds_checks(of_time[name], of_placed)
+        name: (*evidence_checks(found, names, tolerance), *pairing_checks(found))
         for name, found in evidence.items()
     }
-
-
-def _clouds_checks(
-    own: Sequence[Check], of_placed: Mapping[str, Sequence[Check]]
-) -> tuple[Check, ...]:
-    """Faults of the clouds' time that other cameras show: the clouds are common to all cameras."""
-    if any(check.status != "PASS" for check in own):
-        return ()  # they show it
-    return tuple(
-        Check("clouds of another time", "WARN", f"by camera {other}: {check.text}")
-        for other, checks in of_placed.items()
-        for check in checks
-        if check.status != "PASS"
-    )
 
 
 def evidence_checks(
@@ -103,14 +84,21 @@ def evidence_checks(
             "image and cloud"
         )
         return (Check("image evidence", "WARN", text, found.groups),)
-    row, advice, lost = threshold("displaced_z_score"), "", found.frames_lost
-    if found.frames_best < limit("frames_best"):
-        advice = f"{row.advice}; frames {', '.join(names[n] for n in lost[:5])} fit another better"
-    displaced = row.check(found.displaced_z_score, advice=advice)
+    displaced = threshold("displaced_z_score").check(found.displaced_z_score)
+    of_pose = displaced, frames_check(found, names)
     mispaired = found.frames_best <= limit("lens_frames_best")
     if found.displaced_z_score < limit("lens_z_score") or mispaired:
-        return (displaced,)  # at a wrong extrinsic the lens cannot be measured
-    return displaced, *(check_parameter(each, IMAGES, tolerance) for each in found.lens)
+        return of_pose  # at a wrong extrinsic the lens cannot be measured
+    return *of_pose, *(check_parameter(each, IMAGES, tolerance) for each in found.lens)
+
+
+def frames_check(found: ImageEvidence, names: Mapping[int, str]) -> Check:
+    """Whether the frames of a camera fit one extrinsic: something may have moved meanwhile.
+
+    A solve leaves such frames out, and the rest agrees.
+    """
+    row, lost = threshold("frames_best"), ", ".join(names[n] for n in found.frames_lost[:5])
+    return row.check(found.frames_best, advice=f"{lost} fit another extrinsic better: {row.advice}")
 
 
 def pairing_checks(found: ImageEvidence) -> tuple[Check, ...]:

@@ -222,8 +222,6 @@ def measure_lens(  # noqa: PLR0913 - what is measured, and by what
     From a camera at the result and its scores there at the level ``WIDE``. Of the principal point,
     the coordinate along the longer side of the image is free.
     """
-    if camera.model == "equirectangular":
-        return ()  # its format determines it
     # Across the longer side of the image, a principal point cannot be told from a rotation.
     along = Free.CENTRE_X if camera.width_px >= camera.height_px else Free.CENTRE_Y
     finer = Free.FOCAL, Free.RADIAL, along  # right shapes are nearer to zero without a finer fit

@@ -100,7 +100,7 @@ def find_doubts(rig: Rig, frame: Frame, cloud: Cloud) -> Iterator[str]:
             "motion was corrected?"
         )
     is_message = frame.cloud_path.suffix == MESSAGE_SUFFIX
-    if is_message and frame.is_corrected and scan_duration_s(frame.cloud_path) == 0:
+    if is_message and frame.find_motion and scan_duration_s(frame.cloud_path) == 0:
         yield (
             f"all points of the cloud of frame {frame.name} have the same time, so that --motion "
             "moves it as a whole: record the times of points, or leave --motion out if the driver "

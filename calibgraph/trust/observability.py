@@ -1,13 +1,12 @@
-"""Weakly observable parts of a solution, in words: weakest direction, empty parts, prior share."""
+"""Weakly observable parts of a solution, in words: weakest direction, empty parts."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.model.geometry import camera_center, pose_rows
+from calibgraph.model.geometry import camera_center
 from calibgraph.model.rig import Camera
-from calibgraph.solver.covariance import pose_equations
 from calibgraph.solver.matches import CameraBlock
 from calibgraph.solver.robust import quantile
 from calibgraph.solver.solution import Solution
@@ -75,24 +74,3 @@ def empty_parts(camera: Camera, block: CameraBlock, T_camera_lidar: Array) -> li
     if far < _SHALLOW * near:
         words.append("all at about one distance: turn and shift are hard to distinguish")
     return words
-
-
-def prior_shares(solution: Solution) -> dict[str, float]:
-    """Per camera, which share of its result comes from priors and relative poses, not from matches.
-
-    It is the mean over the camera's six components of the priors' influence, the diagonal of
-    C H_prior: 0 if the matches decide alone, 1 if there are none. C is the (6 N, 6 N) marginal of
-    the error model; without one, of independent matches.
-    """
-    T_camera_lidar, errors = solution.T_camera_lidar, solution.error_fit
-    cameras = list(T_camera_lidar)
-    priors = pose_equations(solution.inliers.pose_graph, cameras, T_camera_lidar)[0]
-    known = None if errors is None else errors.of_mount.covariance
-    if known is None:
-        hessian = priors.copy()
-        for name, of_camera in solution.fitted.robust_hessians.items():
-            rows = pose_rows(cameras.index(name))
-            hessian[rows, rows] += of_camera
-        known = np.asarray(np.linalg.pinv(hessian, hermitian=True))
-    influence = np.diag(known @ priors).reshape(-1, 6).mean(axis=1)
-    return dict(zip(cameras, np.clip(influence, 0.0, 1.0).tolist(), strict=True))

@@ -13,7 +13,7 @@ mean, not the sum: with that the truth is as likely under it as by one camera al
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 
 import gtsam
@@ -26,11 +26,9 @@ from calibgraph.io.dataset import Dataset, spread_out
 from calibgraph.matching.structure.consensus import FAR, log_likelihood
 from calibgraph.model.geometry import pose_rows, relative_transform, twist_between
 from calibgraph.model.rig import RelativePose, Rig
-from calibgraph.model.verdict import Check
 from calibgraph.parallel import Threads, core_pool
 from calibgraph.trust.image_evidence import FrameScorer
 from calibgraph.trust.probability import probability_beyond
-from calibgraph.trust.thresholds import threshold
 from factors import pose_sigmas
 
 MAX_FRAMES = 10  # evenly spread over the dataset: bounds the time
@@ -170,11 +168,6 @@ def group_tied(
     return [*dict.fromkeys(named)]
 
 
-def no_posteriors(*_: object, **__: object) -> dict[str, PosePosterior]:
-    """Of no camera: where there are no images."""
-    return {}
-
-
 def widen(joint: Array, moments: Mapping[int, Array]) -> Array:
     """A covariance that is at least that of the posteriors, in every direction of each camera.
 
@@ -208,40 +201,6 @@ MeasurePosteriors = Callable[
 ]
 """The posteriors by the images, of the (6, 6) covariances by the matches and of groups of cameras
 that move together."""
-
-
-@dataclass(frozen=True, eq=False)
-class ImagePosteriors:
-    """The (6 N, 6 N) error bar of matches beside the posteriors of cameras with scored images.
-
-    The wider one is reported, of a batch and while driving.
-    """
-
-    cameras: Sequence[str]
-    by_matches: Array
-    posteriors: Mapping[str, PosePosterior] = field(default_factory=dict)
-
-    def widen(self, joint: Array) -> Array:
-        """(6 N, 6 N): a covariance, widened where the images' evidence is flat."""
-        found = self.posteriors.items()
-        return widen(joint, {self.cameras.index(name): of.moments for name, of in found})
-
-    def probability_beyond(self, camera: str, tolerance: tuple[float, float]) -> float:
-        """The probability that a camera's error is beyond a tolerance [deg, cm]."""
-        rows = pose_rows(self.cameras.index(camera))
-        own = self.by_matches[rows, rows]
-        if camera not in self.posteriors:
-            return probability_beyond(own, tolerance)
-        return self.posteriors[camera].probability_beyond(own, tolerance)
-
-    def check_flatness(self) -> dict[str, Check]:
-        """Per camera with a posterior, whether the images leave its pose more open."""
-        if not self.posteriors:
-            return {}
-        wide, narrow = np.diag(self.widen(self.by_matches)), np.diag(self.by_matches)
-        ratios = np.sqrt(wide / narrow).reshape(-1, 6).max(axis=1)
-        row, of_cameras = threshold("flat_evidence"), zip(self.cameras, ratios, strict=True)
-        return {name: row.check(ratio) for name, ratio in of_cameras if name in self.posteriors}
 
 
 def measured_pairs(poses: Iterable[RelativePose]) -> Iterator[tuple[str, str, Array]]:

@@ -10,7 +10,6 @@ from calibgraph.model.calibration import Residuals
 from calibgraph.model.lens import LensEstimate
 from calibgraph.model.verdict import COMMON_ERROR, Check
 from calibgraph.solver.error_model import Conflict
-from calibgraph.solver.robust import CAUCHY_SCALE_SIGMAS
 from calibgraph.solver.solution import Solution
 from calibgraph.trust.evidence import Checks, Estimate, Evidence
 from calibgraph.trust.thresholds import threshold
@@ -125,8 +124,13 @@ def _check_lens_prior(one: LensEstimate) -> Check:
 
 def flat_evidence_checks(evidence: Evidence) -> Checks:
     """Whether the images leave a pose more open than the matches, where images are known."""
-    flatness = {} if evidence.bars is None else evidence.bars.check_flatness()
-    return {name: [check] for name, check in flatness.items()}
+    checks = {}
+    for name in evidence.posteriors:
+        wide, narrow = evidence.covariance_of(name), evidence.covariance_by_matches(name)
+        if wide is not None and narrow is not None:
+            ratio = float(np.sqrt(np.diag(wide) / np.diag(narrow)).max())
+            checks[name] = [threshold("flat_evidence").check(ratio)]
+    return checks
 
 
 def outlier_frame_checks(evidence: Evidence) -> Checks:
@@ -147,26 +151,8 @@ def repeated_frame_checks(evidence: Evidence) -> Checks:
     return checks
 
 
-def assumed_spread_checks(evidence: Evidence) -> Checks:
-    """The residuals' spread over the one that a configured loss scale stands for."""
-    loss_scale_px = evidence.solution.config.loss_scale_px
-    if loss_scale_px is None:
-        return {}
-    row, residuals = threshold("assumed_spread"), residuals_of(evidence.solution)
-    return {
-        name: [row.check(CAUCHY_SCALE_SIGMAS * residuals[name].sigma_px / loss_scale_px)]
-        for name in evidence.fitted_blocks
-    }
-
-
 def residuals_of(solution: Solution) -> dict[str, Residuals]:
     """Per camera that has correspondences, of all of them, not only the inliers."""
     poses, scales = solution.T_camera_lidar, solution.scales
     blocks = solution.objective.blocks.items()
     return {name: block.summary(poses[name], scales[name]) for name, block in blocks}
-
-
-def prior_share_checks(evidence: Evidence) -> Checks:
-    """How much of a result comes from priors and relative poses."""
-    row = threshold("prior_share")
-    return {name: [row.check(share)] for name, share in evidence.prior_shares.items()}

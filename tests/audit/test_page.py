@@ -13,7 +13,6 @@ from calibgraph.audit.page import measured_camera
 from calibgraph.model.geometry import twist_between
 from tests.audit.deployed import TRUTH
 from tests.conftest import SAMPLE
-from tests.report.browsing import render
 from tests.report.conftest import read_page
 
 DEVIATION = np.array([0.001, 0.02, 0, 0.01, 0, -0.02])
@@ -94,12 +93,3 @@ def test_the_measured_camera_deviates_as_was_measured() -> None:
     found = twist_between(deployed.T_camera_lidar, measured.T_camera_lidar)
     np.testing.assert_allclose(found, DEVIATION, atol=1e-12)
     assert measured_camera(deployed, NOTHING) is None
-
-
-def test_a_browser_shows_it_without_errors_and_without_a_network(tmp_path: Path) -> None:
-    page_of(audit_with(WRONG, FEW, RIGHT), tmp_path)
-    rendering = render(tmp_path / "check.html", tmp_path)
-    assert (rendering.errors, rendering.requests) == ([], [])
-    red = (rendering.picture[:400, :60] == (0x20, 0x00, 0xB0)).all(axis=2)  # BGR: WRONG
-    assert red.sum() > 500
-    assert rendering.picture[600:].std() > 20  # not blank: overlays

@@ -24,7 +24,7 @@ from calibgraph import (
     load_rig,
 )
 from calibgraph.io.bags.pictures import image_from_message
-from calibgraph.io.bags.rig import read_bag_rig, rig_of_bag
+from calibgraph.io.bags.rig import read_bag_rig
 from calibgraph.io.frame import hash_source
 from tests.conftest import SAMPLE
 from tests.io.bags.writing import (
@@ -246,10 +246,10 @@ def test_cameras_of_one_namespace_have_their_own_lens(
     tmp_path: Path, image: str, info: str
 ) -> None:
     bag = recording(tmp_path, renamed(image, info))
-    by_frame = {camera.frame_id: camera for camera in rig_of_bag(bag).cameras.values()}
+    by_frame = {camera.frame_id: camera for camera in load_rig(bag).cameras.values()}
     assert len(by_frame) == len(NAMES)
     topics = {name: image.format(name, n) for n, name in enumerate(NAMES)}
-    for name, camera in rig_of_bag(bag, BagOptions(topics=topics)).cameras.items():
+    for name, camera in load_rig(bag, BagOptions(topics=topics)).cameras.items():
         assert camera.frame_id == f"{name}_optical"
         np.testing.assert_allclose(camera.T_camera_lidar, RIG.T_camera_lidar[name], atol=1e-9)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
@@ -27,16 +26,10 @@ from calibgraph.io.formats import EXPORT_FORMATS
 from calibgraph.io.formats.export import WRITERS
 from calibgraph.simulation.rigs import rig_of
 from tests.conftest import make_pair
-from tests.io.formats.conftest import rig_for, varied_rig
+from tests.io.formats.conftest import varied_rig
 from tests.io.formats.readers import READERS, angles_pose, worked_points
 
 LIDAR_POSE = angles_pose([1.2, -0.1, 1.9], 0.02, -0.03, 1.4)
-
-
-def exported_text(path: Path) -> str:
-    """The text of a file and of the one beside it."""
-    beside = path.with_name(f"{path.stem}.direction.txt")
-    return path.read_text() + (beside.read_text() if beside.exists() else "")
 
 
 def test_each_format_has_a_meaning_a_writer_and_an_independent_reader() -> None:
@@ -47,9 +40,9 @@ def test_each_format_has_a_meaning_a_writer_and_an_independent_reader() -> None:
 def test_an_independent_reader_finds_the_extrinsics_that_the_worked_point_proves(
     format: str, tmp_path: Path
 ) -> None:
-    rig, path = rig_for(format), tmp_path / "file.txt"
+    rig, path = varied_rig(), tmp_path / "file.txt"
     export_calibration(rig, path, format)
-    found, points = READERS[format](path), worked_points(exported_text(path))
+    found, points = READERS[format](path), worked_points(path.read_text())
     assert set(found) == set(points) == set(rig.cameras)
     for name, T in rig.T_camera_lidar.items():
         np.testing.assert_allclose(found[name], T, atol=1e-9, rtol=0)
@@ -120,18 +113,10 @@ def test_lenses_are_exported_under_the_names_of_others(mixed_rig: Rig, tmp_path:
         assert node.getNode("fisheye_model").real() == (camera.model == "fisheye")
 
 
-@pytest.mark.parametrize(
-    ("format", "camera", "said"),
-    [
-        ("kalibr", "front", "Kalibr's radtan holds 4 distortion coefficients"),
-    ],
-)
-def test_a_lens_that_a_format_cannot_hold_is_refused(
-    format: str, camera: str, said: str, mixed_rig: Rig, tmp_path: Path
-) -> None:
-    with pytest.raises(CalibrationError, match=re.escape(said)) as caught:
-        export_calibration(mixed_rig, tmp_path / "file", format, cameras=[camera])
-    assert caught.value.camera == camera
+def test_a_lens_that_a_format_cannot_hold_is_refused(mixed_rig: Rig, tmp_path: Path) -> None:
+    with pytest.raises(CalibrationError, match="radtan holds 4 distortion coefficients") as caught:
+        export_calibration(mixed_rig, tmp_path / "file", "kalibr", cameras=["front"])
+    assert caught.value.camera == "front"
     assert not list(tmp_path.iterdir())
 
 
@@ -262,8 +247,6 @@ def test_a_file_has_what_the_parser_of_ros_requires(tmp_path: Path) -> None:
 
 
 def test_what_has_no_place_in_files_of_ros_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(CalibrationError, match="cannot hold a lens of the model equirect"):
-        export_calibration(rig_of("panorama"), tmp_path / "infos", "camera_info")
     camera = make_pair().cameras["left"]
     other = camera.model_copy(update={"frame_id": "other"})
     for names in (("a b", "a_b"), ("A_b", "a_b")):  # one file where systems ignore case
@@ -337,28 +320,3 @@ def test_a_unified_lens_is_imported_as_it_was_exported(
     np.testing.assert_allclose(again.T_camera_lidar, omni.T_camera_lidar, atol=1e-9)
     theirs, ours = (c.model_dump(exclude={"T_camera_lidar"}) for c in (again, omni))
     assert theirs == ours
-
-
-def test_a_panorama_is_written_where_there_is_room_for_it(tmp_path: Path) -> None:
-    rig = rig_of("panorama")
-    for format in ("opencv", "json", "urdf"):
-        export_calibration(rig, tmp_path / f"{format}.yml", format)
-    again = import_rig([tmp_path / "opencv.yml"]).cameras["panorama"]
-    pixels, _ = rig.cameras["panorama"].lens.project(POINT)
-    np.testing.assert_allclose(again.lens.project(POINT)[0], pixels, atol=1e-9)
-    with pytest.raises(CalibrationError, match="cannot hold a.* equirectangular"):
-        export_calibration(rig, tmp_path / "chain.yaml", "kalibr")
-
-
-def test_an_omni_lens_with_another_distortion_is_refused(omni: Camera, tmp_path: Path) -> None:
-    export_calibration(Rig(cameras={"front": omni}), tmp_path / "chain.yaml", "kalibr")
-    text = (tmp_path / "chain.yaml").read_text()
-    for old, new, said in (
-        ("distortion_model: radtan", "distortion_model: fov", "lens model 'fov' is none of"),
-        ("distortion_model: radtan", "distortion_model: equi", "contradict each other"),
-        ("intrinsics: [1.3,", "intrinsics: [-1.3,", "xi of the unified model is -1.3"),
-    ):
-        assert old in text
-        (tmp_path / "wrong.yaml").write_text(text.replace(old, new))
-        with pytest.raises(CalibrationError, match=said):
-            import_rig([tmp_path / "wrong.yaml"])

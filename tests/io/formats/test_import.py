@@ -26,7 +26,7 @@ from calibgraph.io.formats.rig_import import read_rig_parts
 from calibgraph.model.rig import KNOWLEDGE, IntrinsicsSigma
 from tests.conftest import RADTAN5, make_camera, stereo_relative_pose
 from tests.io.formats.calibration_files import FRONT
-from tests.io.formats.conftest import rig_for, varied_rig
+from tests.io.formats.conftest import varied_rig
 from tests.io.written import written_kitti
 
 FORMS = yaml.safe_load((Path(__file__).parent / "forms.yaml").read_text())
@@ -177,7 +177,7 @@ def test_one_frame_serves_all_cameras_of_a_chain(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("format", ["kalibr", "ros2-launch", "urdf", "autoware", "opencv"])
 def test_what_was_exported_is_imported_again(format: str, tmp_path: Path) -> None:
-    rig = rig_for(format)
+    rig = varied_rig()
     suffix = {"urdf": "urdf", "ros2-launch": "launch.xml"}.get(format, "yaml")
     path = tmp_path / f"file.{suffix}"
     export_calibration(rig, path, format)
@@ -199,7 +199,7 @@ def test_what_was_exported_is_imported_again(format: str, tmp_path: Path) -> Non
 
 
 def test_a_json_export_is_a_rig(mixed_rig: Rig, tmp_path: Path) -> None:
-    for rig in (mixed_rig, rig_for("json")):
+    for rig in (mixed_rig, varied_rig()):
         export_calibration(rig, tmp_path / "rig.json", "json", force=True)
         for read in (load_rig(tmp_path / "rig.json"), import_rig([tmp_path / "rig.json"])):
             assert list(read.cameras) == list(rig.cameras)
