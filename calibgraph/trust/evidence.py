@@ -135,7 +135,8 @@ class Evidence:
 
     def covariance_by_matches(self, camera: str) -> Array | None:
         """(6, 6) of one camera, not widened by what the images leave open."""
-        return self._rows_of(self.solution.covariance, camera)
+        known, travel = self.solution.covariance, self.solution.travel
+        return self._rows_of(None if known is None else known + travel @ travel.T, camera)
 
     def _rows_of(self, joint: Array | None, camera: str) -> Array | None:
         if joint is None or camera in self.solution.held:
