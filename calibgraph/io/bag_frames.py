@@ -217,6 +217,7 @@ def frames_of_bag(
         for name, count in others.items() if count
     )  # fmt: skip
     _, cells = np.unique(np.array(clouds.cells)[complete], return_inverse=True)
+    after_s = {n: after_ns(clouds, stamps[images[n]], pairs[n], complete) / _S for n in cameras}
     recorded = tuple(
         Frame(
             start + int(row + cell),
@@ -224,12 +225,12 @@ def frames_of_bag(
             clouds.paths[row],
             {name: stamps[images[name]].paths[pairs[name][row]] for name in cameras},
             lidar_paths={n: stamps[t].paths[pairs[n][row]] for n, t in topics.lidars.items()},
+            images_after_s={name: float(own[number]) for name, own in after_s.items()},
         )
-        for row, cell in zip(complete, cells, strict=True)
+        for number, (row, cell) in enumerate(zip(complete, cells, strict=True))
     )
     late_s = dict[str, Array]()
     if options.motion != "none":
-        after_s = {n: after_ns(clouds, stamps[images[n]], pairs[n], complete) / _S for n in cameras}
         to_s = np.median([*after_s.values()], axis=0) if after_s else np.zeros(len(complete))
         late_s = {name: own - to_s for name, own in after_s.items()}
         find = motion_finder(path, recorded, options)
