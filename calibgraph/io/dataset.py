@@ -30,7 +30,7 @@ from calibgraph.io.clouds import (
 )
 from calibgraph.io.dataset_folders import folder_layout, frames_of_folder, published_folder
 from calibgraph.io.frame import Frame, Kept, twist_by_scans
-from calibgraph.io.frame_files import way_out
+from calibgraph.io.frame_files import stated_stamps, way_out
 from calibgraph.io.rigs import describe_rig, read_rig
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.parallel import KeyedCache
@@ -197,12 +197,14 @@ def _frames_of_files(
     files, pairing = frames_of_folder(
         path, [*rig.cameras], lidars=rig.all_lidars, complete=complete, sync_tolerance_s=tolerance_s
     )
+    stamps_ns = stated_stamps(path, files) if rig.other_lidars else [None] * len(files)
     frames = tuple(
         Frame(
             start + n,
             prefix + each.stem,
             each.cloud,
             each.images,
+            recorded_ns=stamps_ns[n],
             columns=rig.cloud_columns,
             lidar_paths=each.lidars,
         )
