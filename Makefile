@@ -15,7 +15,7 @@ export PYTHONDONTWRITEBYTECODE :=
 help: ## Show this list
 	@awk -F':.*## ' '/^[a-z-]+:.*## /{printf "  make %-9s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
-TEST := [test,simulation,learned,ros,fleet,view,service]
+TEST := [test,simulation,learned,ros,fleet,service]
 DOCS := $(TEST:]=,docs])
 
 # One call of pip, and modules are compiled on all cores; those of other versions of Python cannot be.

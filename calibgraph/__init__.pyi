@@ -3,7 +3,6 @@
 from .audit import Audit as Audit
 from .audit import CameraAudit as CameraAudit
 from .audit import Drift as Drift
-from .audit import LidarAudit as LidarAudit
 from .audit import check as check
 from .audit import drift as drift
 from .audit.fleet_model import FleetModel as FleetModel
@@ -32,7 +31,6 @@ from .guessing.template import write_rig_template as write_rig_template
 from .io.bags.camera_info import camera_from_message as camera_from_message
 from .io.bags.pictures import image_from_message as image_from_message
 from .io.bags.point_clouds import cloud_from_message as cloud_from_message
-from .io.bags.rig import rig_of_bag as rig_of_bag
 from .io.bags.storage import BagOptions as BagOptions
 from .io.calibrations import load_calibration as load_calibration
 from .io.dataset import Dataset as Dataset
@@ -69,7 +67,6 @@ from .model.verdict import Check as Check
 from .model.verdict import Verdict as Verdict
 from .pipeline import calibrate as calibrate
 from .pipeline import solve as solve
-from .report.mcap_file import write_mcap as write_mcap
 from .simulation.correspondences import MatcherErrors as MatcherErrors
 from .simulation.correspondences import simulate_correspondences as simulate_correspondences
 from .simulation.recording import simulate_street as simulate_street

@@ -140,7 +140,7 @@ def _load(
         given = rig if rig is not None else load_rig(folders[0])
         cameras = list(given.cameras)
         found = [f for path in folders for f in frames_of_folder(path, cameras, complete=False)[0]]
-        paired = [str(i) for i, files in enumerate(found) if files.images.keys() >= set(cameras)]
+        paired = [str(i) for i, one in enumerate(found) if one.image_paths.keys() >= {*cameras}]
         return load_dataset(folders, rig, frames=",".join(paired)) if paired else None
     except (CalibrationError, OSError):
         return None

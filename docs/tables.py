@@ -110,13 +110,13 @@ API = {
     "judge": """
         calibrate solve load_config preset evaluate perturb check write_audit_report drift
         Calibration Residuals Verdict Check Config Evaluation PoseError Audit CameraAudit
-        LidarAudit Drift
+        Drift
     """,
     "data": """
         load_dataset dataset_from_arrays cloud_from_message image_from_message
-        camera_from_message load_rig rig_of_bag load_correspondences concatenate
+        camera_from_message load_rig load_correspondences concatenate
         load_camera_matches load_calibration diagnose import_rig export_calibration
-        describe_rig write_rig_template guess_rig write_mcap Rig Camera
+        describe_rig write_rig_template guess_rig Rig Camera
         Intrinsics RelativePose Dataset Frame BagOptions Diagnosis Finding Correspondences
         CameraMatches RigGuess CameraGuess
     """,

@@ -378,7 +378,7 @@ def projection_residual(
     by_pose = np.zeros((3, 6), order="F")
     point_camera = T_lidar_camera.transformTo(point_lidar_m, by_pose)
     pixels, by_point = lens.project_with_jacobian(point_camera)
-    return lens.subtract(pixels, pixel_px)[0], by_point[0] @ by_pose
+    return pixels[0] - pixel_px, by_point[0] @ by_pose
 
 
 def projection_factor(

@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from factors import kernel
 from factors.lens import Lens, LensModel
-from factors.lens_kernels import EQUIRECTANGULAR, FISHEYE, OMNIDIRECTIONAL, PINHOLE
+from factors.lens_kernels import FISHEYE, OMNIDIRECTIONAL, PINHOLE
 
 Array = NDArray[np.float64]
 
@@ -33,7 +33,6 @@ COEFFICIENT_NUMBERS: Mapping[int, Mapping[str, int]] = {
     PINHOLE: {"k1": 0, "k2": 1, "p1": 2, "p2": 3, "k3": 4},
     FISHEYE: {"k1": 0, "k2": 1, "k3": 2, "k4": 3},
     OMNIDIRECTIONAL: {"k1": 1, "k2": 2, "p1": 3, "p2": 4},
-    EQUIRECTANGULAR: {},
 }
 """By the kind of lens, the distortion coefficients that may be free, and their places."""
 
@@ -125,7 +124,6 @@ class Columns:
 
     def __post_init__(self) -> None:
         known = [*LENS, *COEFFICIENT_NUMBERS[self.lens.kind]]
-        known = [] if self.lens.kind == EQUIRECTANGULAR else known
         unknown = [name for name in self.parameters if name not in (*known, *CLOCK, *DISTORTION)]
         if unknown:
             raise ValueError(f"this lens has no free {', '.join(unknown)}")

@@ -36,7 +36,6 @@ from factors.lens_kernels import (
     is_projectable,
     project_one,
     project_radtan,
-    subtract_columns,
 )
 
 FAST = {"reassoc", "contract", "nsz", "arcp"}
@@ -421,7 +420,7 @@ def project(kind, lens, T, columns, start, n, tile):  # type: ignore[no-untyped-
         y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
         z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
         u, v, ux[i], uy[i], uz[i], vx[i], vy[i], vz[i] = project_one(kind, lens, x, y, z)
-        ru[i], rv[i] = subtract_columns(kind, lens, u, columns[3, at]), v - columns[4, at]
+        ru[i], rv[i] = u - columns[3, at], v - columns[4, at]
         rx[i], ry[i], rz[i] = x, y, z
 
 

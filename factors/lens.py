@@ -22,7 +22,6 @@ from numpy.typing import ArrayLike, NDArray
 from factors.arrays import contiguous
 from factors.compiled import compiled
 from factors.lens_kernels import (
-    EQUIRECTANGULAR,
     FISHEYE,
     LIMIT,
     OMNIDIRECTIONAL,
@@ -32,20 +31,18 @@ from factors.lens_kernels import (
 )
 
 Array = NDArray[np.float64]
-LensModel = Literal["pinhole", "fisheye", "omnidirectional", "equirectangular"]
+LensModel = Literal["pinhole", "fisheye", "omnidirectional"]
 
 COEFFICIENTS: dict[LensModel, tuple[int, ...]] = {
     "pinhole": (0, 4, 5, 8),
     "fisheye": (4,),
     "omnidirectional": (5,),
-    "equirectangular": (0,),
 }
 """How many distortion coefficients each model has."""
 ORDERS: dict[LensModel, str] = {
     "pinhole": "[], [k1, k2, p1, p2], [k1, k2, p1, p2, k3] or [k1, k2, p1, p2, k3, k4, k5, k6]",
     "fisheye": "[k1, k2, k3, k4]",
     "omnidirectional": "[xi, k1, k2, p1, p2]",
-    "equirectangular": "[]",
 }
 """The distortion coefficients of each model in their order, which is OpenCV's."""
 _NO_JACOBIANS, _NO_VALIDITY = np.empty((0, 6)), np.empty(0, np.bool_)
@@ -63,7 +60,7 @@ class Lens:
     """A lens, packed for the kernels. Build it with :meth:`of`.
 
     Attributes:
-        kind: of ``lens_kernels``: PINHOLE, FISHEYE, OMNIDIRECTIONAL or EQUIRECTANGULAR.
+        kind: of ``lens_kernels``: PINHOLE, FISHEYE or OMNIDIRECTIONAL.
         packed: (13,) fx fy cx cy [px], eight distortion coefficients in the order of ``ORDERS``,
             then zeros, and the limit of the injective domain: a normalised radius (pinhole) or a
             field angle [rad] (fisheye, omnidirectional).
@@ -86,9 +83,7 @@ class Lens:
 
         ``pinhole`` has OpenCV's radial-tangential distortion; ``fisheye`` is Kannala and Brandt's
         (OpenCV ``fisheye``, Kalibr and ROS ``equidistant``); ``omnidirectional`` is the unified
-        model of Mei (OpenCV ``omnidir``, Kalibr ``omni-radtan``), with 0 <= xi. A panorama,
-        ``equirectangular``, has u = fx longitude + cx, v = fy latitude + cy, right and down are
-        positive; a whole one of width W has fx = W / (2 pi), and its columns go round.
+        model of Mei (OpenCV ``omnidir``, Kalibr ``omni-radtan``), with 0 <= xi.
 
         Raises:
             ValueError: on another number of coefficients, or a focal length that is not positive.
@@ -108,14 +103,6 @@ class Lens:
         """Resolution along u on the camera's axis [px/rad]."""
         fx = float(self.packed[0])
         return fx / (1.0 + float(self.packed[4])) if self.kind == OMNIDIRECTIONAL else fx
-
-    def subtract(self, pixels_px: Array, others_px: Array) -> Array:
-        """(n, 2) differences of pixels; across the seam of a panorama the short way."""
-        difference = pixels_px - others_px
-        if self.kind == EQUIRECTANGULAR:
-            turn = 2.0 * math.pi * self.packed[0]
-            difference[:, 0] -= turn * np.floor(difference[:, 0] / turn + 0.5)
-        return np.asarray(difference)
 
     def project(self, points_camera_m: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:
         """Project points.
@@ -231,7 +218,6 @@ _KINDS: dict[LensModel, tuple[int, Callable[[tuple[float, ...]], float]]] = {
     "pinhole": (PINHOLE, _radtan_limit),
     "fisheye": (FISHEYE, _fisheye_limit),
     "omnidirectional": (OMNIDIRECTIONAL, _omnidirectional_limit),
-    "equirectangular": (EQUIRECTANGULAR, lambda _: math.pi),
 }
 """The kind of each model, and the limit of its domain by its coefficients."""
 
@@ -251,13 +237,6 @@ def _first_omnidirectional_rays(packed: Array, points: Array) -> Array:
     return np.column_stack([points * sideways[:, None], np.cos(found)])
 
 
-def _equirectangular_rays(angles_rad: Array) -> Array:
-    """(n, 3) unit rays of angles (n, 2) to the right and down."""
-    right, down = angles_rad.T
-    flat = np.cos(down)
-    return np.column_stack([np.sin(right) * flat, np.sin(down), np.cos(right) * flat])
-
-
 def unproject(lens: Lens, pixels_px: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:
     """Viewing rays of pixels, by Newton's method on the unit sphere.
 
@@ -273,16 +252,14 @@ def unproject(lens: Lens, pixels_px: ArrayLike) -> tuple[Array, NDArray[np.bool_
     rays = _first_rays(lens, pixels)
     for _ in range(_ITERATIONS):
         projected, by_ray = lens.project_with_jacobian(rays)
-        missing = lens.subtract(pixels, projected)
+        missing = pixels - projected
         if not len(rays) or np.abs(missing).max() < _CONVERGED_PX:
             break
         rays = rays + np.einsum("nij,nj->ni", _right_inverse(by_ray), missing)
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     back, valid = lens.project(rays)
     with np.errstate(invalid="ignore"):
-        return rays, valid & (
-            np.abs(lens.subtract(back, pixels)).max(axis=1, initial=0.0) < _MISS_PX
-        )
+        return rays, valid & (np.abs(back - pixels).max(axis=1, initial=0.0) < _MISS_PX)
 
 
 def ray_spreads(lens: Lens, rays: Array) -> Array:
@@ -307,8 +284,6 @@ def _first_rays(lens: Lens, pixels: Array) -> Array:
     """(n, 3) rays without distortion."""
     fx, fy, cx, cy = lens.packed[:4]
     x, y = (pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy
-    if lens.kind == EQUIRECTANGULAR:
-        return _equirectangular_rays(np.column_stack([x, y]))
     if lens.kind == OMNIDIRECTIONAL:
         return _first_omnidirectional_rays(lens.packed, np.column_stack([x, y]))
     radius = np.hypot(x, y)

@@ -13,10 +13,7 @@ from factors.compiled import compiled
 MIN_DEPTH_M = 0.05
 """Points with a smaller z are not projectable by a pinhole."""
 
-MIN_POLAR_SHARE = 1e-6
-"""Sine of the angle from a panorama's poles within which it has no longitude."""
-
-PINHOLE, FISHEYE, OMNIDIRECTIONAL, EQUIRECTANGULAR = range(4)
+PINHOLE, FISHEYE, OMNIDIRECTIONAL = range(3)
 LIMIT = 12
 """Index of the domain's limit in the packed parameters; infinite if a pinhole is undistorted."""
 
@@ -37,8 +34,6 @@ def project_one(kind, lens, x, y, z):  # type: ignore[no-untyped-def]
         return _fisheye(lens, x, y, z)
     if kind == OMNIDIRECTIONAL:
         return _omnidirectional(lens, x, y, z)
-    if kind == EQUIRECTANGULAR:
-        return _equirectangular(lens, x, y, z)
     return project_radtan(lens, x, y, z)
 
 
@@ -149,27 +144,6 @@ def _fisheye(lens, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @compiled(part=True)
-def _equirectangular(lens, x, y, z):  # type: ignore[no-untyped-def]
-    """Longitude and latitude times fx and fy, see ``project_one``."""
-    fx, fy = lens[0], lens[1]
-    n2 = x * x + y * y + z * z
-    # At the poles there is no longitude: the derivative is held, so that it is finite.
-    flat = max(math.sqrt(x * x + z * z), MIN_POLAR_SHARE * math.sqrt(n2), 1e-12)
-    n2 = max(n2, 1e-24)
-    f2 = flat * flat
-    return (
-        fx * math.atan2(x, z) + lens[2],
-        fy * math.atan2(y, flat) + lens[3],
-        fx * z / f2,
-        0.0,
-        -fx * x / f2,
-        -fy * x * y / (n2 * flat),
-        fy * flat / n2,
-        -fy * y * z / (n2 * flat),
-    )
-
-
-@compiled(part=True)
 def _omnidirectional(lens, x, y, z):  # type: ignore[no-untyped-def]
     """The unified model with its Jacobian, see ``project_one``.
 
@@ -239,15 +213,4 @@ def is_projectable(kind, lens, x, y, z):  # type: ignore[no-untyped-def]
     """Whether a point of the camera frame lies inside the lens' injective domain."""
     if kind in (FISHEYE, OMNIDIRECTIONAL):
         return x * x + y * y + z * z > 0.0 and math.atan2(math.hypot(x, y), z) < lens[LIMIT]
-    if kind == EQUIRECTANGULAR:
-        return math.hypot(x, z) > MIN_POLAR_SHARE * abs(y)
     return (z > MIN_DEPTH_M) & (x * x + y * y <= (lens[LIMIT] * z) ** 2)
-
-
-@compiled(inline="always")
-def subtract_columns(kind, lens, u, other):  # type: ignore[no-untyped-def]
-    """Difference of two columns u [px]; across the seam of a panorama the short way."""
-    if kind != EQUIRECTANGULAR:
-        return u - other
-    turn = 2.0 * math.pi * lens[0]
-    return u - other - turn * math.floor((u - other) / turn + 0.5)

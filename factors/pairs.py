@@ -40,7 +40,7 @@ from factors.columns import Columns
 from factors.compiled import compiled
 from factors.kernel import FAST, TILE, WIDTH, add_products, weigh
 from factors.lens import Lens, ray_spreads, unproject
-from factors.lens_kernels import is_projectable, project_one, subtract_columns
+from factors.lens_kernels import is_projectable, project_one
 from factors.pose import lossless_factor
 
 Array = NDArray[np.float64]
@@ -255,7 +255,7 @@ def _fill_surface(kind, lens, T_a, M, feature, sigma, tile, i, n):  # type: igno
     y1 = M[1, 0] * f0 + M[1, 1] * f1 + M[1, 2] * f2 + w * M[1, 3]
     y2 = M[2, 0] * f0 + M[2, 1] * f1 + M[2, 2] * f2 + w * M[2, 3]
     u, v, ux, uy, uz, vx, vy, vz = project_one(kind, lens, y0, y1, y2)
-    tile[12, i] = subtract_columns(kind, lens, u, feature[6]) / sigma
+    tile[12, i] = (u - feature[6]) / sigma
     tile[12, n + i] = (v - feature[7]) / sigma
     for row in range(2):
         jx, jy, jz = (ux, uy, uz) if row == 0 else (vx, vy, vz)

@@ -29,9 +29,8 @@ from calibgraph import (
 )
 from calibgraph.cli import app as cli
 from calibgraph.cli import terminal
-from calibgraph.report import plots
 from calibgraph.simulation.world import INSTALL_LIBRARIES
-from calibgraph.trust import assess, image_checks, inputs
+from calibgraph.trust import assess, image_evidence, inputs
 
 Call = Callable[..., tuple[int, str, str]]
 
@@ -153,12 +152,7 @@ class CommandRun:
     folder: Path
 
 
-def leave_out_diagrams(patch: pytest.MonkeyPatch) -> None:
-    for name in ("coverage", "residual_map"):
-        patch.setattr(plots, name, lambda *_: "data:image/png;base64,")
-
-
-def run_command(*arguments: object, folder: Path, diagrams: bool = False) -> CommandRun:
+def run_command(*arguments: object, folder: Path) -> CommandRun:
     """Run the command line in this process, outside of a test's fixtures."""
     out, err = io.StringIO(), io.StringIO()
     with (
@@ -167,8 +161,6 @@ def run_command(*arguments: object, folder: Path, diagrams: bool = False) -> Com
         contextlib.redirect_stderr(err),
         pytest.raises(SystemExit) as exit_,
     ):
-        if not diagrams:
-            leave_out_diagrams(patch)
         patch.setattr(sys, "argv", ["calibgraph", *map(str, arguments)])
         cli.main()
         raise SystemExit(0)
@@ -199,21 +191,14 @@ def calibrate_sample(folder: Path) -> CommandRun:
     table.save(folder / "table.parquet")
     result = folder / "result"
     return run_command(
-        "calibrate", SAMPLE, "--matcher", folder / "table.parquet", "--out", result, folder=result,
-        diagrams=True,
-    )  # fmt: skip
-
-
-@pytest.fixture
-def blank_diagrams(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Do not draw the diagrams of reports, for tests of all else."""
-    leave_out_diagrams(monkeypatch)
+        "calibrate", SAMPLE, "--matcher", folder / "table.parquet", "--out", result, folder=result
+    )
 
 
 @pytest.fixture
 def no_image_checks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Do not check results and guesses against the images, for tests of all else."""
-    monkeypatch.setattr(image_checks, "check_images", lambda *_, **__: {})
+    monkeypatch.setattr(image_evidence, "check_images", lambda *_, **__: {})
     for module in (assess, inputs):
         monkeypatch.setattr(module, "likely_intended_guess", lambda *_: None)
 

@@ -22,15 +22,16 @@ from calibgraph import (
     perturb,
     simulate_correspondences,
 )
-from calibgraph.graph.variables import MOST_CAMERAS, body_key, camera_key
+from calibgraph.graph.variables import MOST_CAMERAS, aligned_key, camera_key
 from calibgraph.model.config import preset
 from calibgraph.model.geometry import invert, twist_between
 from calibgraph.model.places import Places
 from tests.conftest import SAMPLE, Call, stereo_relative_pose
+from tests.draws.lenses import with_known_lenses
 from tests.matching.structure.data import with_noise_images
 from tests.solver.test_places import minimize
 
-pytestmark = pytest.mark.usefixtures("blank_diagrams", "no_image_checks")
+pytestmark = pytest.mark.usefixtures("no_image_checks")
 
 FRAMES = 6
 STATED = {
@@ -196,11 +197,12 @@ def test_an_excluded_camera_that_the_rig_lacks_is_refused(guess: Rig, truth: Rig
 def test_the_result_is_the_optimum_of_its_graph(truth: Rig, guess: Rig, config: Config) -> None:
     """GTSAM's Levenberg-Marquardt, from where all poses of a camera are equal."""
     table = table_of(truth).with_places(Places(places=((0, 1, 2), (3, 4, 5))))
-    result = calibgraph.solve(guess.moved_to(truth.T_camera_lidar), table, config)
+    known = with_known_lenses(guess.moved_to(truth.T_camera_lidar))
+    result = calibgraph.solve(known, table, config)
     values = minimize(result.graph, values_of(result))
     covariance = result.joint_covariance
-    of = body_key if config.preset == "auto" else camera_key
-    keys = [of(number) for number in range(len(truth.cameras))]
+    of = aligned_key if config.preset == "auto" else camera_key
+    keys = [*map(of, range(len(truth.cameras)))]
     for number, (name, T) in enumerate(result.T_camera_lidar.items()):
         found = invert(values.atPose3(keys[number]).matrix())
         sigmas = np.sqrt(np.diag(covariance))[6 * number : 6 * number + 6]

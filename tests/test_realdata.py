@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import cv2
@@ -11,8 +10,8 @@ import pytest
 
 import calibgraph
 from calibgraph import Rig
+from calibgraph.progress import no_progress
 from calibgraph.rounds import match_in_rounds
-from tests.conftest import Call
 
 pytestmark = pytest.mark.realdata
 
@@ -76,7 +75,7 @@ def test_other_rigs_and_sensors_improve_in_rotation(realdata: Path, name: str) -
 
 
 def test_a_camera_that_turns_half_a_degree_while_driving_is_found(
-    realdata: Path, tmp_path: Path, call: Call
+    realdata: Path, tmp_path: Path
 ) -> None:
     """19 frames of four sequences as one drive; the images of image_2 are turned from frame 10 on.
 
@@ -99,17 +98,16 @@ def test_a_camera_that_turns_half_a_degree_while_driving_is_found(
             folder = tmp_path / "drive" / "cameras" / name
             folder.mkdir(parents=True, exist_ok=True)
             cv2.imwrite(str(folder / f"{number:06d}.png"), image)
+    drive = calibgraph.load_dataset(tmp_path / "drive", data.rig)
     guess = calibgraph.perturb(data.rig, rotation_deg=1, translation_m=0.1, seed=1)
-    guess.save(tmp_path / "rig.yaml")
-    code, out, _ = call(
-        "track", tmp_path / "rig.yaml", tmp_path / "drive", "--matcher", "structure",
-        "--out", tmp_path / "out",
-    )  # fmt: skip
-    updates = [json.loads(line) for line in out.splitlines()]
-    told = [e for update in updates for e in update["events"] if e["kind"] != "started"]
-    assert code == 0 and len(updates) == 19
-    assert [(e["kind"], e["camera"], e["frame"]) for e in told] == [("moved", "image_2", 10)]
-    assert told[0]["detected_frame"] <= 14
-    found = calibgraph.load_calibration(tmp_path / "out")
+    start = calibgraph.calibrate(drive.only(drive.frames[:5]), guess)
+    matcher, tracker = calibgraph.StructureMatcher(), calibgraph.IncrementalCalibrator(start.rig)
+    near, told = {"round_index": matcher.tracking_rounds[-1], "progress": no_progress}, []
+    for frame in drive.frames:
+        table = matcher.match(drive.only([frame]), tracker.rig, **near)
+        told += [e for e in tracker.update(table).events if e.kind != "started"]
+    assert [(e.kind, e.camera, e.frame) for e in told] == [("moved", "image_2", 10)]
+    assert told[0].detected_frame <= 14
+    found = tracker.calibration()
     for name, error in calibgraph.evaluate(found.rig, after).cameras.items():
         assert error.rotation_error_deg < 0.3 and error.translation_error_cm < 8, name

@@ -22,7 +22,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr, ndtri
+from scipy.special import ndtr
 
 from benchmarks.accuracy import ledger
 from benchmarks.accuracy.ledger import Key, Record
@@ -40,7 +40,7 @@ from calibgraph import (
     load_rig,
     perturb,
 )
-from calibgraph.audit.judgement import CAMERA_AXES, FALSE_ALARM_RATE, POWER, tail_of_axis
+from calibgraph.audit.judgement import CAMERA_AXES, FALSE_ALARM_RATE, POWER, Limits
 from calibgraph.audit.result import by_unit
 from calibgraph.simulation.scan_errors import draw_scan_errors
 from tools.scenes.sensor_streets import ALIGNMENT, RIGS, aligned_rig, mean_poses, render
@@ -215,25 +215,25 @@ def stated_by(records: list[Record]) -> Iterator[tuple[tuple[str, str], Array]]:
 
 def to_record(audit: Audit) -> Record:
     """Per camera what was found, and what is WRONG."""
-    tail = tail_of_axis(len(audit.cameras))
+    rate = FALSE_ALARM_RATE / len(audit.cameras)
     return {
         "wrong": list(audit.wrong),
-        "cameras": {name: _camera(camera, tail) for name, camera in audit.cameras.items()},
-        "motion": None if audit.lidar is None else by_unit("motion", audit.lidar.motion),
+        "cameras": {name: _camera(camera, rate) for name, camera in audit.cameras.items()},
+        "motion": None if audit.lidar is None else by_unit("motion", audit.lidar.deviation),
     }
 
 
-def _camera(camera: CameraAudit, tail: float) -> Record:
+def _camera(camera: CameraAudit, rate: float) -> Record:
     """What an audit states of a camera, with the limits of a significant deviation.
 
     Args:
         camera: its audit.
-        tail: probability of a larger deviation by chance, to either side.
+        rate: probability of a significant deviation by chance.
     """
     found = {"status": camera.status, "reason": camera.reason, "trusted": _is_trusted(camera)}
     if camera.deviation is None or camera.sigma is None or camera.detectable is None:
         return found
-    limit = float(-ndtri(tail)) * camera.sigma
+    limit = Limits.of(np.inf, rate, np.ones(2)).axis * camera.sigma
     return {
         **found,
         "significant": (np.abs(camera.deviation) > limit).tolist(),

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from benchmarks.accuracy.uncertainty import ERRORS
 from benchmarks.tables import Table, parser_of, publish
-from calibgraph import Calibration, Drift, drift, simulate_correspondences, solve
+from calibgraph import Calibration, drift, simulate_correspondences, solve
 from calibgraph.audit.judgement import CAMERA_AXES
 from tests.draws.places import displaced, stereo
 
@@ -33,13 +33,15 @@ SHARED = np.repeat([np.radians(0.09), 0.02], 3)
 """Sigma per axis of the shared error, half of its variance the cloud's and half each camera's."""
 KINDS = ("sharp", "shared", "common")
 FRAMES, MATCHES = 10, 100
-SIZES = {"deg": (0.05, 0.1, 0.2, 0.5, 1.0, 2.0), "cm": (1.0, 2.0, 5.0, 10.0, 20.0)}
 TOLERANCE = {"tolerance_deg": 1e-6, "tolerance_cm": 1e-6}
 COUNTS = (2, 3, 5, 10)
 COMPARED = 5
 TIMES = (0.5, 0.75, 1.0, 1.25, 1.5)
 CALLS_PER_CELL = 5
 """One of so many calls for each cell of a table of detections."""
+WAYS = {**{name: (axis,) for axis, name in enumerate(CAMERA_AXES)}, "turn": (0, 1, 2),
+        "shift": (3, 4, 5)}  # fmt: skip
+"""Axes of a motion; of several, its direction is random."""
 
 
 def main() -> None:
@@ -50,8 +52,6 @@ def main() -> None:
     options = parser.parse_args()
     pools = {kind: fill_pool(kind, options.pool) for kind in KINDS}
     tables = [false_alarms(pools, options.calls)]
-    for kind in ("sharp", "shared"):
-        tables += detections(kind, pools[kind], options.calls // CALLS_PER_CELL)
     tables.append(at_detectable(pools, options.calls // CALLS_PER_CELL))
     publish(tables)
 
@@ -105,83 +105,48 @@ def false_alarms(pools: dict[str, list[Calibration]], calls: int) -> Table:
                  tuple(rows))  # fmt: skip
 
 
-def detections(kind: str, pool: list[Calibration], calls: int) -> list[Table]:
-    """Per axis and size, how often a moved camera was named with its axis."""
-    rng = np.random.default_rng(20)
-    tables = []
-    for unit, axes, scale in (("deg", range(3), np.pi / 180), ("cm", range(3, 6), 0.01)):
-        rows, others = [], []
-        for axis in axes:
-            found = [
-                np.mean([count_call(pool, axis, size * scale, 1.0, rng) for _ in range(calls)], 0)
-                for size in SIZES[unit]
-            ]
-            others += [other for _, other in found]
-            smallest = np.median(
-                [smallest_of(drift(choose(pool, COMPARED, rng)), axis) for _ in range(20)]
-            )
-            rows.append(
-                (
-                    CAMERA_AXES[axis],
-                    f"{smallest / scale:.2f}",
-                    *(f"{right:.0%}" for right, _ in found),
-                )
-            )
-        title = (
-            f"{kind}: one camera of one of {COMPARED} results moved, named with its axis; "
-            f"another result or camera named too in {np.mean(others):.1%}"
-        )
-        heads = ("axis", f"detectable [{unit}]", *(f"{size:g} {unit}" for size in SIZES[unit]))
-        tables.append(Table(title, heads, tuple(rows)))
-    return tables
-
-
-def smallest_of(found: Drift, axis: int) -> float:
-    """The smallest detectable change of the first camera in the first result."""
-    smallest = next(iter(found.cameras.values()))[0].detectable
-    assert smallest is not None
-    return float(smallest[axis])
-
-
 def at_detectable(pools: dict[str, list[Calibration]], calls: int) -> Table:
-    """How often changes of multiples of the stated smallest detectable change are found."""
+    """How often changes of multiples of the stated smallest detectable change are found.
+
+    Along one axis, or in a random direction of a turn or a shift.
+    """
     rng = np.random.default_rng(30)
     rows = []
     for kind in ("sharp", "shared"):
-        for axis in range(6):
-            cells = []
+        for name, parts in WAYS.items():
+            cells, others = [], []
             for times in TIMES:
-                found = [count_call(pools[kind], axis, None, times, rng) for _ in range(calls)]
+                found = [count_call(pools[kind], parts, times, rng) for _ in range(calls)]
                 cells.append(f"{np.mean([right for right, _ in found]):.0%}")
-            rows.append((f"{kind}, {CAMERA_AXES[axis]}", *cells))
-    heads = ("recordings, axis", *(f"{times:g} times" for times in TIMES))
+                others += [other for _, other in found]
+            rows.append((f"{kind}, {name}", *cells, f"{np.mean(others):.1%}"))
+    heads = ("recordings, motion", *(f"{times:g} times" for times in TIMES), "another named")
     title = f"moved by multiples of the stated smallest detectable change, {calls} calls each"
     return Table(f"{title} (at 1: stated 90 %)", heads, tuple(rows))
 
 
 def count_call(
-    pool: list[Calibration], axis: int, size: float | None, times: float, rng: Rng
+    pool: list[Calibration], axes: tuple[int, ...], times: float, rng: Rng
 ) -> tuple[bool, bool]:
-    """One call: whether the moved camera was named with its axis, and whether another was.
+    """One call: whether the moved camera was named, and whether another was.
 
     Args:
         pool: of results.
-        axis: of the motion.
-        size: of it [rad or m]; that which is stated as detectable if None.
-        times: factor of the size.
+        axes: of the motion.
+        times: its size, in the smallest changes that are stated as detectable.
         rng: chooses results and direction.
     """
     chosen = choose(pool, COMPARED, rng)
-    if size is None:
-        size = smallest_of(drift(chosen), axis)
+    smallest = next(iter(drift(chosen).cameras.values()))[0].detectable
+    assert smallest is not None
+    way = rng.standard_normal(len(axes))
     xi = np.zeros((2, 6))
-    xi[0, axis] = times * size * rng.choice([-1, 1])
+    xi[0, list(axes)] = times * smallest[list(axes)] * way / np.linalg.norm(way)
     first = chosen[0]
     chosen[0] = replace(first, rig=displaced(first.rig, np.zeros(6), xi))
     found = drift(chosen, **TOLERANCE)
-    name = next(iter(found.cameras))
-    others = any(what != (found.results[0], name) for what in found.changed)
-    return axis in found.cameras[name][0].axes, others
+    moved = (found.results[0], next(iter(found.cameras)))
+    return moved in found.changed, any(each != moved for each in found.changed)
 
 
 if __name__ == "__main__":

@@ -1,22 +1,18 @@
-"""Recordings with lenses and clocks that are wrong, right or unknown, and ``--estimate``.
+"""Recordings with lenses and clocks that are wrong, and ``--estimate``.
 
-    python -m benchmarks.accuracy.lens_cases [--sets spoilt right unknown] [--data 05,06] [--jobs 2]
+    python -m benchmarks.accuracy.lens_cases [--sets spoilt late] [--data 05,06] [--jobs 2]
     python -m benchmarks.accuracy.lens_cases --sets rendered --rigs 0:64 --scenes out/mixtures
 
 ``spoilt``: KITTI's lenses are wrong by what the docs of the verdict list, fixed and estimated, and
-the distortion is estimated where nothing was spoilt. ``right``: the whole lens, or the offset, is
-estimated where nothing is wrong, beside the same without: which parameters leave their prior, how
-far cameras move in standard deviations, how much longer it takes. ``unknown``: recordings with
-distortion that the rig states as zero. ``late``: each cloud with the image of the next frame, which
-is 100 ms late. ``rendered``: drives of a camera like KITTI's whose lens and clock are both wrong,
-by the number of the rig, in town at 2 to 15 m/s or on a road at an even speed; calibrated with the
-right values, with the wrong ones, and with the wrong ones estimated.
+the distortion is estimated where nothing was spoilt. ``late``: each cloud with the image of the
+next frame, which is 100 ms late. ``rendered``: drives of a camera like KITTI's whose lens and clock
+are both wrong, by the number of the rig, in town at 2 to 15 m/s or on a road at an even speed;
+calibrated with the right values, with the wrong ones, and with the wrong ones estimated.
 All start 1 degree and 10 cm off. Cases are kept in ``--out``, a line each; a stopped run continues.
 """
 
 from __future__ import annotations
 
-import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -31,7 +27,6 @@ from benchmarks.accuracy.scenes import Folders
 from benchmarks.accuracy.verdicts import STATUSES, class_of
 from benchmarks.tables import ROOT, Table
 from calibgraph import Calibration, Config, Dataset, Rig, calibrate, evaluate, load_dataset, perturb
-from calibgraph.model.geometry import twist_between
 from calibgraph.model.rig import Camera
 from factors.columns import COEFFICIENT_NUMBERS
 from tests.draws.lenses import put_lens_error
@@ -41,17 +36,10 @@ KITTI = ("05", "06", "07", "08", "06+07+08")
 SPOILT = (
     ("focal", 0.03), ("focal", 0.05), ("centre", 20.0), ("distortion", 0.05)
 )  # fmt: skip
-OTHER_RIGS = (
-    "surround6", "nuscenes_a", "dgp_scene01", "opencalib_a", "vlp16_distorted",
-    "acfr_vlp16_fisheye",
-)  # fmt: skip
 DRIVES = ("00", "05", "06", "07", "08", "kitti_raw_0005")
-DISTORTED = ("vlp16_distorted", "opencalib_a", "acfr_vlp16_fisheye")
 INTERVAL_S, START_DEG, START_M, SEED = 0.1, 1.0, 0.1, 1
-FAR_SIGMAS = 3.0
-WIDE_SIGMA = 0.3  # of radial coefficients, where nothing is known of them
 FIXED = "fixed"
-SETS = ("spoilt", "right", "unknown", "late", "rendered")
+SETS = ("spoilt", "late", "rendered")
 
 
 def cases(rigs: Sequence[int]) -> Iterator[Key]:
@@ -62,11 +50,6 @@ def cases(rigs: Sequence[int]) -> Iterator[Key]:
                 yield Key("spoilt", f"{part} {error:g} {how}", name, SEED)
     for name in ("07", "08"):
         yield Key("spoilt", "distortion 0 distortion", name, SEED)
-    yield from (Key("right", "lens", name, SEED) for name in OTHER_RIGS)
-    yield from (Key("right", "offset", name, SEED) for name in DRIVES)
-    for name in DISTORTED:
-        for kind in ("right", "zero", "default", "wide"):
-            yield Key("unknown", kind, name, SEED)
     for name in DRIVES:
         for later in (0, 1):
             for how in (FIXED, "offset"):
@@ -77,22 +60,14 @@ def cases(rigs: Sequence[int]) -> Iterator[Key]:
 
 
 def run_case(case: Key, folders: Folders, scenes: Path) -> Record:
-    """Calibrate one case, and compare; of ``right``, without the estimate before."""
+    """Calibrate one case, and compare."""
     estimate = case.kind.split()[-1]
     data, truth, rig = _load(case, folders, scenes)
-    if case.level == "unknown":
-        estimate = "distortion" if case.kind in ("default", "wide") else FIXED
     if case.level == "rendered":
         estimate = case.data.replace("+", ",") if case.kind == "estimated" else FIXED
-    if case.level != "right":
-        return _to_record(_calibrate(data, rig, estimate, case.seed)[0], truth)
-    before, before_s = _calibrate(data, rig, FIXED, case.seed)
-    after, after_s = _calibrate(_load(case, folders, scenes)[0], rig, estimate, case.seed)
-    record = _to_record(after, truth)
-    for name, camera in record["cameras"].items():
-        camera["before"] = before.camera_verdicts[name].status
-        camera["moved_sigmas"] = _moved(before, after, name)
-    return {**record, "cpu_ratio": after_s / before_s, "cpu_s": before_s}
+    guess = perturb(rig, rotation_deg=START_DEG, translation_m=START_M, seed=case.seed)
+    config = Config() if estimate == FIXED else Config(estimate=estimate)
+    return _to_record(calibrate(data, guess, config=config), truth)
 
 
 def _load(case: Key, folders: Folders, scenes: Path) -> tuple[Dataset, Rig, Rig]:
@@ -106,28 +81,15 @@ def _load(case: Key, folders: Folders, scenes: Path) -> tuple[Dataset, Rig, Rig]
         part, error, _ = case.kind.split()
         spoilt = put_lens_error(truth, part, float(error)) if float(error) else truth  # type: ignore[arg-type]
         return data, truth, spoilt
-    if case.level == "unknown" and case.kind != "right":
-        sigma = WIDE_SIGMA if case.kind == "wide" else None
-        cameras = {
-            name: camera.model_copy(update={
-                "distortion": _without(camera),
-                "distortion_sigma": sigma or camera.distortion_sigma,
-            })
-            for name, camera in truth.cameras.items()
-        }  # fmt: skip
-        return data, truth, truth.model_copy(update={"cameras": cameras})
-    if "offset" in case.kind or case.level == "late":  # with the motion of the LiDAR
-        assert folders.realdata is not None
-        own, kitti = folders.realdata / case.data, folders.realdata / "kitti_odometry" / "sequences"
-        data = load_dataset(own if own.is_dir() else kitti / case.data, interval_s=INTERVAL_S)
-    if case.level == "late":
-        later = int(case.kind.split()[0])
-        pairs = zip(data.frames[: len(data.frames) - later], data.frames[later:], strict=True)
-        frames = tuple(replace(one, image_paths=other.image_paths) for one, other in pairs)
-        data, late = replace(data, frames=frames), {"time_offset_s": later * INTERVAL_S}
-        cameras = {name: camera.model_copy(update=late) for name, camera in truth.cameras.items()}
-        return data, truth.model_copy(update={"cameras": cameras}), truth
-    return data, truth, truth
+    assert folders.realdata is not None
+    own, kitti = folders.realdata / case.data, folders.realdata / "kitti_odometry" / "sequences"
+    data = load_dataset(own if own.is_dir() else kitti / case.data, interval_s=INTERVAL_S)
+    later = int(case.kind.split()[0])
+    pairs = zip(data.frames[: len(data.frames) - later], data.frames[later:], strict=True)
+    frames = tuple(replace(one, image_paths=other.image_paths) for one, other in pairs)
+    data, late = replace(data, frames=frames), {"time_offset_s": later * INTERVAL_S}
+    cameras = {name: camera.model_copy(update=late) for name, camera in truth.cameras.items()}
+    return data, truth.model_copy(update={"cameras": cameras}), truth
 
 
 def _wrong_rig(truth: Rig, seed: int) -> Rig:
@@ -139,20 +101,6 @@ def _wrong_rig(truth: Rig, seed: int) -> Rig:
     times = {"time_offset_s": None, "readout_s": None}
     cameras = {name: camera.model_copy(update=times) for name, camera in rig.cameras.items()}
     return rig.model_copy(update={"cameras": cameras})
-
-
-def _without(camera: Camera) -> tuple[float, ...]:
-    """Zeros for the coefficients that are distortion: xi of a unified lens stays."""
-    kept = camera.distortion[:1] if camera.model == "omnidirectional" else ()
-    return (*kept, *[0.0] * (len(camera.distortion) - len(kept)))
-
-
-def _calibrate(data: Dataset, rig: Rig, estimate: str, seed: int) -> tuple[Calibration, float]:
-    """The result, and the processor time [s]."""
-    guess = perturb(rig, rotation_deg=START_DEG, translation_m=START_M, seed=seed)
-    before = time.process_time()
-    config = Config() if estimate == FIXED else Config(estimate=estimate)
-    return calibrate(data, guess, config=config), time.process_time() - before
 
 
 def values_of(camera: Camera) -> dict[str, float]:
@@ -180,15 +128,6 @@ def _to_record(result: Calibration, truth: Rig) -> Record:
     return record
 
 
-def _moved(before: Calibration, after: Calibration, name: str) -> float | None:
-    """Root mean square over six axes of a camera's step, in the error bar without the estimate."""
-    covariance = before.covariance[name]
-    if covariance is None:
-        return None
-    step = twist_between(after.T_camera_lidar[name], before.T_camera_lidar[name])
-    return float(np.sqrt(step @ np.linalg.solve(covariance, step) / len(step)))
-
-
 def report_verdicts(level: str, records: Sequence[Record]) -> Table:
     """Verdicts by what was wrong."""
     heads = [(off, status) for off in (True, False) for status in STATUSES]
@@ -207,30 +146,6 @@ def report_verdicts(level: str, records: Sequence[Record]) -> Table:
                *(f"{'off' if off else 'right'}: {status}" for off, status in heads),
                "median [deg]", "[cm]", "z^2 of the lens")  # fmt: skip
     return Table(f"{level}: cameras", columns, tuple(rows))
-
-
-def report_right(records: Sequence[Record]) -> Table:
-    """A row per case, and all of them."""
-    columns = (
-        "estimated", "recording", "parameters", f"beyond {FAR_SIGMAS:g} prior sigmas", "largest",
-        "moved, largest [sigma]", "verdicts before", "after", "time ratio",
-    )  # fmt: skip
-    rows, every = [], list[float]()
-    for record in records:
-        cameras = record.get("cameras", {}).values()
-        left = [abs(one["value"] - one["prior"]) / one["prior_sigma"]
-                for camera in cameras for one in camera["lens"]]  # fmt: skip
-        moved = [c["moved_sigmas"] for c in cameras if c["moved_sigmas"] is not None]
-        verdicts = (Counter(camera[key] for camera in cameras) for key in ("before", "status"))
-        rows.append((
-            record["kind"], record["data"], str(len(left)), str(sum(z > FAR_SIGMAS for z in left)),
-            f"{max(left, default=0):.2f}", f"{max(moved, default=np.nan):.2f}",
-            *(", ".join(f"{n} {status}" for status, n in sorted(found.items())) or "refused"
-              for found in verdicts), f"{record.get('cpu_ratio', np.nan):.2f}",
-        ))  # fmt: skip
-        every += left
-    rows.append(("all", "", str(len(every)), str(sum(z > FAR_SIGMAS for z in every)), *[""] * 5))
-    return Table("Nothing wrong", columns, tuple(rows))
 
 
 def report_cameras(level: str, records: Sequence[Record]) -> Table:
@@ -278,9 +193,7 @@ def main() -> None:
     records, tables = ledger.records_of(options, chosen, work), []
     for level in options.sets:
         own = [record for record in records if record["level"] == level]
-        if own and level == "right":
-            tables.append(report_right(own))
-        elif own:
+        if own:
             tables += [report_verdicts(level, own), report_cameras(level, own)]
     ledger.publish_cases(tables, records)
 

@@ -1,7 +1,6 @@
 """The matcher `structure` from far guesses: success, errors, verdicts and time.
 
     python -m benchmarks.accuracy.search --data 00,00+01 --within 20/1.5,2/0.2
-    python -m benchmarks.accuracy.search --kinds dark,half_beams --starts 3 --out out/spoilt.jsonl
     python -m benchmarks.accuracy.search --kinds one_frame,two_frames --within 10/0.5 --starts 6
     python -m benchmarks.accuracy.search --summary out/search.jsonl --cameras
 
@@ -13,26 +12,21 @@ error over the variance of each axis (1 is expected).
 
 from __future__ import annotations
 
-import tempfile
 from collections import Counter
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 
 from benchmarks.accuracy import ledger
 from benchmarks.accuracy.ledger import Key, Record
-from benchmarks.accuracy.scenes import Folders, Scene, paint_images, with_clouds
+from benchmarks.accuracy.scenes import Folders
 from benchmarks.tables import Table
 from calibgraph import Dataset, calibrate, evaluate, perturb
-from tools.scenes.spoilt_images import blurred
 
 SUCCESS_DEG, SUCCESS_CM = 0.5, 15.0
 STATUSES = ("PASS", "WARN", "FAIL")
-BEAM_DEG = 0.4  # about the spacing of 64 beams over 26 degrees
 
 
 def main() -> None:
@@ -65,9 +59,7 @@ def run_case(case: Key, folders: Folders) -> Record:
     data, truth = folders.load(case.data)
     degrees, metres = (float(number) for number in case.level.split("/"))
     guess = perturb(truth, rotation_deg=degrees, translation_m=metres, seed=case.seed, uniform=True)
-    with tempfile.TemporaryDirectory() as folder:
-        scene = Scene(case.data, data, truth, folders, Path(folder), case.seed)
-        result = calibrate(KINDS[case.kind](scene), guess)
+    result = calibrate(KINDS[case.kind](data, case.seed), guess)
     pairs = evaluate(result.rig, truth).pairs
     table = result.correspondences
     return {
@@ -82,44 +74,16 @@ def run_case(case: Key, folders: Folders) -> Record:
     }
 
 
-def _few(scene: Scene, frames: int) -> Dataset:
+def _few(data: Dataset, seed: int, frames: int) -> Dataset:
     """So many frames, from one that the seed chooses."""
-    first = scene.seed % (len(scene.data.frames) - frames + 1)
-    return scene.data.only(scene.data.frames[first : first + frames])
+    first = seed % (len(data.frames) - frames + 1)
+    return data.only(data.frames[first : first + frames])
 
 
-def _half_beams(cloud: Any) -> Any:
-    """Every other band of elevation as wide as the spacing of the beams."""
-    elevation = np.degrees(np.arctan2(cloud[:, 2], np.hypot(cloud[:, 0], cloud[:, 1])))
-    return cloud[np.floor(elevation / BEAM_DEG) % 2 == 0]
-
-
-def _over_exposed(image: Any) -> Any:
-    """So bright that 10 % more of the image is white."""
-    level = np.quantile(image[image < 255], 0.9)
-    return np.clip(image * (255.0 / level), 0, 255).astype(np.uint8)
-
-
-def _painted(change: Callable[[Any], Any], *names: str) -> Callable[[Scene], Dataset]:
-    """Makes the dataset of a scene, with the images of these cameras changed; of all if none."""
-
-    def paint(scene: Scene) -> Dataset:
-        chosen = [name for name in scene.truth.cameras if not names or name in names]
-        return paint_images(scene, chosen, lambda image, *_: change(image))
-
-    return paint
-
-
-KINDS: dict[str, Callable[[Scene], Dataset]] = {
-    "good": lambda scene: scene.data,
+KINDS: dict[str, Callable[[Dataset, int], Dataset]] = {
+    "good": lambda data, seed: data,
     "one_frame": partial(_few, frames=1),
     "two_frames": partial(_few, frames=2),
-    "no_intensity": partial(with_clouds, change=lambda cloud: cloud[:, :3]),
-    "half_beams": partial(with_clouds, change=_half_beams),
-    "dark": _painted(lambda image: (image * 0.15).astype(np.uint8)),
-    "blurred": _painted(lambda image: blurred(image, 2.0)),
-    "over_exposed": _painted(_over_exposed),
-    "covered": _painted(np.zeros_like, "image_3", "CAMERA_09"),
 }
 
 

@@ -7,20 +7,20 @@ from pathlib import Path
 
 import numpy as np
 from scipy.linalg import block_diag
-from scipy.special import ndtri
 
 from calibgraph.arrays import Array
 from calibgraph.audit.judgement import (
+    FALSE_ALARM_RATE,
     SEARCHES_FARTHER,
+    Limits,
     deviation_of,
     find_lidar_motion,
     has_too_few_frames,
     judge_camera,
-    tail_of_axis,
     tolerance_twist,
 )
 from calibgraph.audit.lidars import MeasuredLidars, measure_lidars
-from calibgraph.audit.result import Audit, CameraAudit, LidarAudit
+from calibgraph.audit.result import Audit, CameraAudit
 from calibgraph.errors import CorrespondenceError, FileError
 from calibgraph.io.calibrations import stated_result
 from calibgraph.io.dataset import Dataset, keep_frames, load_dataset
@@ -53,12 +53,12 @@ from calibgraph.solver.solution import Solution
 from calibgraph.trust.agreement import competing_solution_checks, pair_agreement_checks
 from calibgraph.trust.evidence import Checks, Evidence, concatenate, gather_of_run
 from calibgraph.trust.guess import point_distance_checks
-from calibgraph.trust.image_evidence import measure_image_evidence
+from calibgraph.trust.image_evidence import frames_check, measure_image_evidence
 from calibgraph.trust.inputs import describe_copies
 from calibgraph.trust.lens_checks import intrinsics_checks
 from calibgraph.trust.matcher_checks import last_round_checks, matcher_checks
 from calibgraph.trust.solution_checks import estimate_checks, outlier_frame_checks
-from calibgraph.trust.thresholds import limit, threshold
+from calibgraph.trust.thresholds import threshold
 
 _log = logging.getLogger(__name__)
 
@@ -126,25 +126,11 @@ def check(
                 deployed, given, Config(seed=seed), tolerance, sensors=sensors, progress=report
             )
     cameras, evidence = dict[str, CameraAudit](), None
-    try:
-        if deployed.cameras:
-            run = match_from_deployed(
-                data, deployed, full, Config(seed=seed), watch=watch, progress=report
-            )
-            with watch("places"):
-                run = assign_places(run)
-            run = refine_with_camera_pairs(run)
-            with watch("checks"):
-                cameras, evidence = _judge(run, tolerance, report)
-    except CorrespondenceError as error:
-        too_few_matches = error.camera in deployed.cameras and error.row is None
-        if not too_few_matches:  # a wrong table
-            raise
-        nothing = CameraAudit("CANNOT TELL", f"{error}; {SEARCHES_FARTHER}")
-        cameras = dict.fromkeys(deployed.cameras, nothing)
-    finally:
-        full.release()
-    lidar = _judge_lidar(evidence, cameras, lidars)
+    if deployed.cameras:
+        cameras, evidence = _measure_cameras(
+            data, deployed, full, tolerance, config=Config(seed=seed), watch=watch, progress=report
+        )
+    lidar = _judge_lidar(evidence, cameras, lidars, tolerance)
     middle = data.frames[len(data.frames) // 2].with_burnt_in({})  # as it was recorded
     sources = tuple(map(str, data.folders))
     return Audit(
@@ -167,22 +153,41 @@ def _open(data: Dataset, deployed: Rig, matcher: FullMatcher) -> Dataset:
     return choice.dataset if most is None else choice.dataset.spread_out(most)
 
 
-def _judge(
-    run: MatchingRun, tolerance: Array, progress: Progress
-) -> tuple[dict[str, CameraAudit], Evidence | None]:
+def _measure_cameras(
+    data: Dataset, deployed: Rig, matcher: FullMatcher, tolerance: Array, *, config: Config,
+    watch: Stopwatch, progress: Progress,
+) -> tuple[dict[str, CameraAudit], Evidence | None]:  # fmt: skip
     """The audits of all cameras, and the evidence where every measurement can be trusted."""
-    evidence = gather_of_run(run, asks_guess=True)
-    doubts = _doubts(run, evidence, progress)
-    cameras = {
-        name: judge_camera(evidence, name, doubts[name], tolerance) for name in run.guess.cameras
-    }
+    try:
+        run = match_from_deployed(data, deployed, matcher, config, watch=watch, progress=progress)
+        with watch("places"):
+            run = assign_places(run)
+        run = refine_with_camera_pairs(run)
+        with watch("checks"):
+            evidence = gather_of_run(run, asks_guess=True)
+            doubts = _doubts(run, evidence, progress)
+            cameras = {
+                name: judge_camera(evidence, name, doubts[name], tolerance)
+                for name in deployed.cameras
+            }
+    except CorrespondenceError as error:
+        too_few_matches = error.camera in deployed.cameras and error.row is None
+        if not too_few_matches:  # a wrong table
+            raise
+        nothing = CameraAudit("CANNOT TELL", f"{error}; {SEARCHES_FARTHER}")
+        return dict.fromkeys(deployed.cameras, nothing), None
+    finally:
+        matcher.release()
     trusted = not any(doubts.values()) and all(each.sigma is not None for each in cameras.values())
     return cameras, evidence if trusted else None
 
 
 def _judge_lidar(
-    evidence: Evidence | None, cameras: Mapping[str, CameraAudit], lidars: MeasuredLidars | None
-) -> LidarAudit | None:
+    evidence: Evidence | None,
+    cameras: Mapping[str, CameraAudit],
+    lidars: MeasuredLidars | None,
+    tolerance: Array,
+) -> CameraAudit | None:
     """The motion of the LiDAR, of several the base, if one explains the deviations of all others.
 
     None where none is WRONG, or with a single one, which cannot be told from the LiDAR; and where
@@ -208,7 +213,7 @@ def _judge_lidar(
         np.asarray(block_diag(*covariances)),
         poses,
         moved=[k for k, each in enumerate(audits.values()) if each.status == "WRONG"],
-        quantile=float(ndtri(1 - tail_of_axis(len(audits)))),
+        quantile=Limits.of(np.inf, FALSE_ALARM_RATE / len(audits), tolerance).axis[0],
     )
 
 
@@ -229,10 +234,9 @@ def _doubts(run: MatchingRun, evidence: Evidence, progress: Progress) -> dict[st
 def _doubts_by_frames(
     run: MatchingRun, cameras: Collection[str], progress: Progress
 ) -> dict[str, list[str]]:
-    """Per camera, the frames that fit another extrinsic: something moved during the recording.
+    """Per camera, the frames that fit another extrinsic.
 
-    The solve leaves such frames out, and the rest agrees. Nothing is concluded about matchers that
-    use other information than these scores.
+    Nothing is concluded about matchers that use other information than these scores.
     """
     if not run.matcher.image_checks_can_fail or not cameras:
         return {}
@@ -240,15 +244,8 @@ def _doubts_by_frames(
     rig = rig.model_copy(update={"cameras": {name: rig.cameras[name] for name in cameras}})
     found = measure_image_evidence(run.dataset, rig, extrinsics_only=True, progress=progress)
     names = {frame.index: frame.name for frame in run.dataset.frames}
-    return {
-        camera: [
-            f"frames {', '.join(names[number] for number in of_camera.frames_lost[:5])} fit "
-            "another extrinsic better: has the camera or the LiDAR moved during the recording, or "
-            "do their images and clouds not belong together?"
-        ]
-        for camera, of_camera in found.items()
-        if of_camera.frames_best < limit("frames_best")
-    }
+    checks = {name: frames_check(of_camera, names) for name, of_camera in found.items()}
+    return {name: [check.text] for name, check in checks.items() if check.status != "PASS"}
 
 
 def _doubt_by_z_score(z_score: float | None) -> str:

@@ -3,6 +3,7 @@
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import combinations
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -16,15 +17,15 @@ from calibgraph.audit.judgement import (
     LIDAR_AXES,
     SINGLE_CAMERA,
     SINGLE_LIDAR,
+    Limits,
     detectable,
     find_lidar_motion,
     judge_deviation,
-    student_quantiles,
     tolerance_twist,
 )
 from calibgraph.audit.lidars import freedom_of_places
-from calibgraph.audit.model import Deviations, Limits, compare, poses_of
-from calibgraph.audit.result import ORDER, CameraAudit, LidarAudit, lidar_summary
+from calibgraph.audit.model import Deviations, LimitsOf, compare, poses_of
+from calibgraph.audit.result import ORDER, CameraAudit, lidar_summary
 from calibgraph.errors import CalibrationError
 from calibgraph.io.calibrations import load_calibration
 from calibgraph.model.calibration import Calibration
@@ -64,7 +65,7 @@ class Drift:
 
     results: tuple[str, ...]
     cameras: Mapping[str, tuple[CameraAudit, ...]]
-    lidar: tuple[LidarAudit | None, ...]
+    lidar: tuple[CameraAudit | None, ...]
     tolerance_deg: float
     tolerance_cm: float
     false_alarm_rate: float
@@ -134,7 +135,8 @@ def drift(
     opened = open_results(results, own_lenses=own_lenses)
     names, loaded, count = (*opened,), (*opened.values(),), len(opened)
     cameras = loaded[0].joint_names
-    limits = Limits(FALSE_ALARM_RATE / (2 * 6 * len(cameras) * count), tolerance)
+    rate = FALSE_ALARM_RATE / (len(cameras) * count)
+    limits = partial(Limits.of, rate=rate, tolerance=tolerance)
     found = {name: _deviations(loaded, name, limits) for name in cameras}
     judged = {name: _judge(opened, name, each, limits) for name, each in found.items()}
     compared = {name: each for name, each in found.items() if each is not None}
@@ -165,7 +167,7 @@ def _why_unusable(result: Calibration, name: str) -> str:
     return ""
 
 
-def _deviations(results: Sequence[Calibration], name: str, limits: Limits) -> Deviations | None:
+def _deviations(results: Sequence[Calibration], name: str, limits: LimitsOf) -> Deviations | None:
     """The deviations of one camera; None with fewer than two usable results."""
     usable = [k for k, each in enumerate(results) if not _why_unusable(each, name)]
     if len(usable) < 2:  # noqa: PLR2004 - a comparison
@@ -213,7 +215,7 @@ def _axes(result: Calibration, name: str) -> tuple[str, ...]:
 
 
 def _judge(
-    results: Mapping[str, Calibration], camera: str, found: Deviations | None, limits: Limits
+    results: Mapping[str, Calibration], camera: str, found: Deviations | None, limits: LimitsOf
 ) -> tuple[CameraAudit, ...]:
     """The status of one camera in every result."""
     names = [*results]
@@ -225,21 +227,15 @@ def _judge(
     alone = SINGLE_CAMERA if of_one.rig.cameras else SINGLE_LIDAR
     alone = "" if len(of_one.joint_names) > 1 else alone
     for row, place in enumerate(found.poses.results):
-        deviation, sigma, freedom = found.deviation[row], found.sigma[row], found.freedom[row]
-        quantiles = student_quantiles(freedom, limits.tail)
-        status, reason = judge_deviation(
-            deviation,
-            found.covariance[row],
-            quantiles,
-            limits.tolerance,
-            axes=_axes(of_one, camera),
-        )
+        deviation, covariance = found.deviation[row], found.covariance[row]
+        own, sigma = limits(found.freedom[row]), np.sqrt(np.diag(covariance))
+        status, reason = judge_deviation(deviation, covariance, own, axes=_axes(of_one, camera))
         axes: tuple[int, ...] = ()
         if status == "WRONG":
             status = "CHANGED"
-            axes = tuple(np.flatnonzero(limits.exceeded(deviation, sigma, freedom)).tolist())
+            axes = tuple(np.flatnonzero(own.exceeded(deviation, covariance)).tolist())
             reason += _whose_change(names, found, row) + alone
-        smallest = detectable(sigma, quantiles[0])
+        smallest = detectable(sigma, own.axis)
         judged[place] = CameraAudit(status, reason, deviation, sigma, smallest, axes=axes)
     return tuple(judged)
 
@@ -263,8 +259,8 @@ def _lidar(
     compared: Mapping[str, Deviations],
     judged: Mapping[str, tuple[CameraAudit, ...]],
     *,
-    limits: Limits,
-) -> LidarAudit | None:
+    limits: LimitsOf,
+) -> CameraAudit | None:
     """The motion of the LiDAR that explains how all cameras of one result deviate."""
     rows = {name: int(np.flatnonzero(each.poses.results == place)[0])
             for name, each in compared.items() if place in each.poses.results}  # fmt: skip
@@ -280,7 +276,7 @@ def _lidar(
         covariance,
         [compared[name].poses.base for name in rows],
         moved=moved,
-        quantile=float(limits.sigmas(freedom)),
+        quantile=limits(freedom).axis[0],
     )
 
 

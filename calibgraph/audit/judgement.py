@@ -1,8 +1,8 @@
 """From a measured rig and its covariance to OK, WRONG or CANNOT TELL, per camera.
 
-An axis with deviation d and standard deviation sigma is significant if |d| > q sigma; of 1000 rigs
-without any deviation one has such an axis. Quantiles are of Student's t: sigma is itself estimated,
-from the scatter of few frames; its stated part, of the error that all frames share, is known.
+A turn or shift is significant as a whole by its squared sigmas (Hotelling), or along an axis by its
+sigmas (Student); both since sigma is itself estimated, from the scatter of few frames; its stated
+part, of the error that all frames share, is known. Of 1000 rigs that have not moved one has any.
 
 * WRONG: the length of the significant axes of a turn or a shift exceeds the tolerance.
 * OK: each exceeds it with a probability of at most 5 %, given d and the covariance, and a change as
@@ -13,24 +13,25 @@ from the scatter of few frames; its stated part, of the error that all frames sh
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import chdtri, fdtri, ndtri, stdtrit
 
 from calibgraph.arrays import Array, Mask
-from calibgraph.audit.result import CameraAudit, LidarAudit
+from calibgraph.audit.result import CameraAudit
 from calibgraph.model.error_sources import MATCHES, MOST_TIMES, ErrorSources
 from calibgraph.model.findings import UNKNOWN, MatcherFindings, error_components
 from calibgraph.model.geometry import to_T_lidar_camera, twist_between
 from calibgraph.solver.covariance import ENOUGH_FRAMES, PSEUDO_FRAMES
-from calibgraph.tracking.cause import Steps, find_cause, squared_sigmas
+from calibgraph.tracking.cause import Steps, find_cause
 from calibgraph.trust.evidence import Evidence
 from calibgraph.trust.probability import probability_outside
 from factors import pose_sigmas
 
 FALSE_ALARM_RATE = 1e-3
-"""Probability of a significant axis on a rig, of all its cameras, that has not changed."""
+"""Probability of a significant deviation on a rig, of all its sensors, that has not changed."""
 
 POWER = 0.9
 """Probability with which the smallest detectable change is told from none."""
@@ -78,23 +79,23 @@ def judge_camera(evidence: Evidence, name: str, doubt: str, tolerance: Array) ->
         covariance = covariance + np.diag(pose_sigmas(rotation_rad=rad, translation_m=metres) ** 2)
     sigma = np.sqrt(np.diag(covariance))
     sources = evidence.error_sources.get(name)
-    quantiles = _quantiles(evidence, name, sources)
+    limits = _limits(evidence, name, sources, tolerance)
     least = np.zeros(6)
     if sources is not None:
         now = np.array([sources.rotation_deg, sources.translation_cm])
         least = np.repeat(sources.forecast[MOST_TIMES] / now, 3)
-    status, reason = judge_deviation(deviation, covariance, quantiles, tolerance, least=least)
+    status, reason = judge_deviation(deviation, covariance, limits, least=least)
     if status == "WRONG" and name in evidence.posteriors:
         posterior = evidence.posteriors[name]
         widest = posterior.widest(covariance)
-        allowed = posterior.log_ratio < quantiles[0].max() ** 2
-        if allowed or judge_deviation(deviation, widest, quantiles, tolerance)[0] != "WRONG":
+        allowed = posterior.log_ratio < limits.axis.max() ** 2
+        if allowed or judge_deviation(deviation, widest, limits)[0] != "WRONG":
             status, reason = "CANNOT TELL", f"{_IMAGES_ALLOW}; {reason}"
     if doubt:
         status, reason = "CANNOT TELL", doubt
     elif status == "WRONG" and len(evidence.cameras) == 1:
         reason += SINGLE_CAMERA
-    smallest = detectable(sigma, quantiles[1])
+    smallest = detectable(sigma, limits.confident)
     return CameraAudit(status, reason, deviation, sigma, smallest, z_score)
 
 
@@ -105,14 +106,16 @@ def has_too_few_frames(evidence: Evidence, name: str) -> bool:
     return few and evidence.covariance_of(name) is not None
 
 
-def _quantiles(evidence: Evidence, name: str, sources: ErrorSources | None) -> Array:
-    tail = tail_of_axis(len(evidence.cameras))
-    known, block = student_quantiles(np.inf, tail), evidence.solution.inliers.blocks.get(name)
+def _limits(
+    evidence: Evidence, name: str, sources: ErrorSources | None, tolerance: Array
+) -> Limits:
+    rate = FALSE_ALARM_RATE / len(evidence.cameras)
+    block = evidence.solution.inliers.blocks.get(name)
     if block is None or sources is None:
-        return known
-    estimated = student_quantiles(block.frames - 1 + PSEUDO_FRAMES, tail)
+        return Limits.of(np.inf, rate, tolerance)
     shares = [axis.get(MATCHES, 0.0) for axis in (sources.rotation, sources.translation)]
-    return quantiles_in_part(np.repeat(shares, 3), estimated, known)
+    freedom = block.frames - 1 + PSEUDO_FRAMES
+    return Limits.of(freedom, rate, tolerance, estimated=np.repeat(shares, 3))
 
 
 def deviation_of(evidence: Evidence, name: str) -> Array:
@@ -124,34 +127,27 @@ def deviation_of(evidence: Evidence, name: str) -> Array:
 def judge_deviation(
     deviation: Array,
     covariance: Array,
-    quantiles: Array,
-    tolerance: Array,
+    limits: Limits,
     *,
     least: Array | float = 0.0,
     axes: tuple[str, ...] = CAMERA_AXES,
-    together: float = np.inf,
 ) -> tuple[str, str]:
     """The status of a trusted measurement, and its reason.
 
     Args:
         deviation: (6,) of all axes.
         covariance: (6, 6) of it.
-        quantiles: (2, 6) of its standard deviations, see :func:`student_quantiles`.
-        tolerance: (2,) of the turn [rad] and of the shift [m].
+        limits: of this measurement.
         least: (6,) share of sigma that remains however many frames are recorded.
         axes: (6) their names.
-        together: squared sigmas of a turn or a shift from which on all its axes are significant.
     """
-    sigma, (largest, confident) = np.sqrt(np.diag(covariance)), quantiles
-    significant = np.abs(deviation) > largest * sigma
-    for part in (slice(3), slice(3, 6)):
-        significant[part] |= squared_sigmas(deviation[part], covariance[part, part]) > together
-    wrong = axes_beyond(deviation, significant, tolerance)
+    sigma, significant = np.sqrt(np.diag(covariance)), limits.significant(deviation, covariance)
+    wrong = limits.exceeded(deviation, covariance)
     if wrong.any():
         return "WRONG", describe_motion(deviation, sigma, wrong, axes)
-    needed, most = detectable(sigma, confident), np.repeat(tolerance, 3)
+    needed, most = detectable(sigma, limits.confident), np.repeat(limits.tolerance, 3)
     blind = needed > most
-    unsure = blind | _may_be_beyond(deviation, covariance, confident, tolerance)
+    unsure = blind | _may_be_beyond(deviation, covariance, limits)
     if unsure.any():
         found = describe_motion(deviation, sigma, unsure, axes)
         recording_helps = not (least * needed > most).any()
@@ -163,13 +159,13 @@ def judge_deviation(
     return "OK", "no significant deviation, and within the tolerance"
 
 
-def _may_be_beyond(deviation: Array, covariance: Array, confident: Array, tolerance: Array) -> Mask:
+def _may_be_beyond(deviation: Array, covariance: Array, limits: Limits) -> Mask:
     """(6,) the largest axes of a turn or shift that is not certainly within the tolerance."""
-    wider = confident / ndtri(CONFIDENCE)  # as few frames have it
+    wider = limits.confident / ndtri(CONFIDENCE)  # as few frames have it
     covariance = covariance * np.outer(wider, wider)
-    reach = np.abs(deviation) + confident * np.sqrt(np.diag(covariance))
+    reach = np.abs(deviation) + limits.confident * np.sqrt(np.diag(covariance))
     unsure = np.zeros(6, np.bool_)
-    for part, most in zip((slice(0, 3), slice(3, 6)), tolerance, strict=True):
+    for part, most in zip((slice(0, 3), slice(3, 6)), limits.tolerance, strict=True):
         beyond = probability_outside(deviation[part], covariance[part, part], most)
         if beyond > 1 - CONFIDENCE:
             unsure[part] = reach[part] > 0.5 * reach[part].max()
@@ -195,7 +191,7 @@ def find_lidar_motion(
     *,
     moved: Collection[int],
     quantile: float,
-) -> LidarAudit | None:
+) -> CameraAudit | None:
     """The motion of the LiDAR, if one explains the deviations of all cameras; else None.
 
     A LiDAR beside it is a camera here.
@@ -222,7 +218,8 @@ def find_lidar_motion(
         return None
     motion, sigma = -lidar[0], np.sqrt(np.diag(lidar[1]))
     clear = np.abs(motion) > quantile * sigma
-    return LidarAudit(describe_motion(motion, sigma, clear, LIDAR_AXES), motion, sigma)
+    reason = describe_motion(motion, sigma, clear, LIDAR_AXES)
+    return CameraAudit("WRONG", reason, motion, sigma)
 
 
 def describe_motion(motion: Array, sigma: Array, which: Mask, axes: tuple[str, ...]) -> str:
@@ -254,47 +251,73 @@ def tolerance_twist(tolerance_deg: float, tolerance_cm: float) -> Array:
     return np.asarray(np.array([tolerance_deg, tolerance_cm]) / DISPLAY[::3])
 
 
-def axes_beyond(deviation: Array, significant: Mask, tolerance: Array) -> Mask:
-    """(..., 6) True for the significant axes of a turn or a shift that are too large together.
+@dataclass(frozen=True, eq=False)
+class Limits:
+    """What a measured deviation is compared with.
 
-    Args:
-        deviation: (..., 6) rotation and translation.
-        significant: (..., 6) the axes that count.
-        tolerance: (2,) largest turn and shift.
+    Attributes:
+        axis: (..., 6) sigmas along an axis that chance does not explain.
+        whole: (..., 2) squared sigmas of a turn, and of a shift, that it does not explain.
+        confident: (..., 6) sigmas of an upper bound by CONFIDENCE.
+        tolerance: (2,) largest turn [rad] and shift [m].
     """
-    parts = np.where(significant, deviation, 0.0).reshape(*deviation.shape[:-1], 2, 3)
-    is_large = np.linalg.norm(parts, axis=-1) > tolerance
-    return np.asarray(significant & np.repeat(is_large, 3, axis=-1))
+
+    axis: Array
+    whole: Array
+    confident: Array
+    tolerance: Array
+
+    @classmethod
+    def of(
+        cls, freedom: ArrayLike, rate: float, tolerance: Array, *, estimated: Array | float = 1.0
+    ) -> Limits:
+        """The limits of a sensor that without a motion exceeds one with some probability.
+
+        Half of it is for the axes, to either side, and half for the turn and shift as a whole.
+
+        Args:
+            freedom: degrees of freedom of the sigmas, (..., 6) or of all; infinite where known.
+            rate: the probability.
+            tolerance: (2,) largest turn [rad] and shift [m].
+            estimated: (..., 6) share of the variances that is estimated; the rest is known. Squares
+                add up (after Cochran): a quarter of the alarms if the shares are alike.
+        """
+        freedom = np.broadcast_to(freedom, np.broadcast_shapes(np.shape(freedom), (6,)))
+        known, tail = np.full(6, np.inf), rate / (2 * 2 * 6)
+        axis, confident, whole = (
+            estimated * of(freedom) + (1 - estimated) * of(known)
+            for of in (
+                lambda nu: stdtrit(nu, tail) ** 2,
+                lambda nu: stdtrit(nu, CONFIDENCE) ** 2,
+                lambda nu: _hotelling(nu, rate / (2 * 2)),
+            )
+        )
+        largest = whole.reshape(*whole.shape[:-1], 2, 3).max(axis=-1)
+        return cls(np.sqrt(axis), largest, np.sqrt(confident), tolerance)
+
+    def significant(self, deviation: Array, covariance: Array) -> Mask:
+        """(..., 6) the axes beyond their limit; all of a turn or shift that only as a whole is."""
+        sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
+        found = np.abs(deviation) > self.axis * sigma
+        for k, part in enumerate((slice(3), slice(3, 6))):
+            xi = deviation[..., part, None]
+            squared = (xi * np.linalg.solve(covariance[..., part, part], xi)).sum(axis=(-2, -1))
+            only_whole = (squared > self.whole[..., k]) & ~found[..., part].any(axis=-1)
+            found[..., part] |= only_whole[..., None]
+        return np.asarray(found)
+
+    def exceeded(self, deviation: Array, covariance: Array) -> Mask:
+        """(..., 6) the significant axes of a turn or shift that together exceed the tolerance."""
+        significant = self.significant(deviation, covariance)
+        parts = np.where(significant, deviation, 0.0).reshape(*deviation.shape[:-1], 2, 3)
+        is_large = np.linalg.norm(parts, axis=-1) > self.tolerance
+        return np.asarray(significant & np.repeat(is_large, 3, axis=-1))
 
 
-def student_quantiles(freedom: ArrayLike, tail: float) -> Array:
-    """(2, 6) numbers of sigmas: the largest deviation by chance; the upper bound by CONFIDENCE.
-
-    Args:
-        freedom: degrees of freedom of the sigmas, (6,) or of all; infinite where known.
-        tail: probability of a larger deviation by chance, to either side.
-    """
-    freedom = np.broadcast_to(np.asarray(freedom, np.float64), 6)
-    return np.array([-stdtrit(freedom, tail), stdtrit(freedom, CONFIDENCE)])
-
-
-def limit_together(freedom: float, sensors: int) -> float:
-    """Squared sigmas that a turn or a shift exceeds by chance: Hotelling's distribution."""
-    quantile = fdtri(3, freedom - 2, 1 - FALSE_ALARM_RATE / (2 * sensors))
-    return float(3 * freedom / (freedom - 2) * quantile)
-
-
-def quantiles_in_part(share: Array, estimated: Array, known: Array) -> Array:
-    """(2, 6) of a variance of which a (6,) share is estimated: squares add up (after Cochran).
-
-    It errs on the side of fewer alarms: a quarter of the stated ones if the shares are alike.
-    """
-    return np.asarray(np.sqrt(share * estimated**2 + (1 - share) * known**2))
-
-
-def tail_of_axis(cameras: int) -> float:
-    """Probability of a significant deviation by chance, of one of six axes, to either side."""
-    return FALSE_ALARM_RATE / (2 * 6 * cameras)
+def _hotelling(freedom: Array, tail: float) -> Array:
+    """Squared sigmas of three axes, estimated together, that chance exceeds so often."""
+    free = np.where(np.isinf(freedom), 1e9, freedom) - 2
+    return np.asarray(3 * (free + 2) / free * fdtri(3, free, 1 - tail))
 
 
 def detectable(sigma: Array, quantile: float | Array) -> Array:

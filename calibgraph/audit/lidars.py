@@ -13,13 +13,12 @@ from scipy.linalg import block_diag
 
 from calibgraph.arrays import Array
 from calibgraph.audit.judgement import (
+    FALSE_ALARM_RATE,
     LIDAR_AXES,
     SINGLE_LIDAR,
+    Limits,
     detectable,
     judge_deviation,
-    limit_together,
-    student_quantiles,
-    tail_of_axis,
 )
 from calibgraph.audit.result import CameraAudit
 from calibgraph.errors import CalibrationError, RigError
@@ -91,21 +90,18 @@ def measure_lidars(
     ]
     covariance = _covariance(found, deployed)
     freedom = freedom_of_places(found.poses.places, len(names))
-    quantiles = student_quantiles(freedom, tail_of_axis(sensors))
-    together = limit_together(freedom, sensors)
+    limits = Limits.of(freedom, FALSE_ALARM_RATE / sensors, tolerance)
     audits = {}
     for row, name in enumerate(names):
         own = covariance[6 * row : 6 * row + 6, 6 * row : 6 * row + 6]
-        status, reason = judge_deviation(
-            deviations[row], own, quantiles, tolerance, axes=LIDAR_AXES, together=together
-        )
+        status, reason = judge_deviation(deviations[row], own, limits, axes=LIDAR_AXES)
         if doubt := _doubt(found, name):
             status, reason = "CANNOT TELL", doubt
         elif status == "WRONG" and sensors == 1:
             reason += SINGLE_LIDAR
         sigma = np.sqrt(np.diag(own))
         audits[name] = CameraAudit(
-            status, reason, deviations[row], sigma, detectable(sigma, quantiles[1])
+            status, reason, deviations[row], sigma, detectable(sigma, limits.confident)
         )
     return MeasuredLidars(audits, np.concatenate(deviations), covariance, T_lidar_base)
 

@@ -14,14 +14,14 @@ A covariance from F frames is itself uncertain: in the tests deviations follow S
 Welch and Satterthwaite's degrees of freedom of the sum of P_r and the centre's covariance.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import stdtrit
 
 from calibgraph.arrays import Array, Mask
-from calibgraph.audit.judgement import axes_beyond
+from calibgraph.audit.judgement import Limits
 from calibgraph.model.geometry import twists_between
 
 _EYE = np.eye(6)
@@ -141,31 +141,8 @@ def poses_of(results: list[int], T_camera_lidar: Array, covariance: Array, freed
     return Poses(np.array(results, np.intp), base, twist, covariance, information, freedom)
 
 
-@dataclass(frozen=True)
-class Limits:
-    """An axis deviates if it is significant, and such axes together exceed the tolerance.
-
-    Attributes:
-        tail: probability of a larger deviation by chance, to either side.
-        tolerance: (2,) of a turn [rad], of a shift [m].
-    """
-
-    tail: float
-    tolerance: Array
-
-    def sigmas(self, freedom: Array) -> Array:
-        """Number of sigmas that is significant with these degrees of freedom."""
-        return np.asarray(-stdtrit(freedom, self.tail), np.float64)
-
-    def exceeded(self, deviation: Array, sigma: Array, freedom: Array) -> Mask:
-        """(..., 6) True for axes beyond both limits."""
-        significant = np.abs(deviation) > self.sigmas(freedom) * sigma
-        return axes_beyond(deviation, significant, self.tolerance)
-
-    def are_exceeded(self, deviation: Array, covariance: Array, freedom: Array) -> Mask:
-        """(n,) True for results with an axis beyond both limits."""
-        exceeded = self.exceeded(deviation, np.sqrt(_variances(covariance)), freedom)
-        return np.asarray(exceeded.any(axis=1))
+LimitsOf = Callable[[Array], Limits]
+"""The limits of deviations with (n, 6) degrees of freedom."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,11 +164,6 @@ class Deviations:
     covariance: Array
     freedom: Array
 
-    @property
-    def sigma(self) -> Array:
-        """(n, 6) standard deviations."""
-        return np.sqrt(_variances(self.covariance))
-
     def coefficients(self, r: int) -> Array:
         """(n, 6, 6) derivative of the deviation of r by the twist of each result."""
         W = np.where((self.pool & (np.arange(len(self.pool)) != r))[:, None, None],
@@ -201,7 +173,7 @@ class Deviations:
         return entering
 
 
-def compare(poses: Poses, limits: Limits) -> Deviations:
+def compare(poses: Poses, limits: LimitsOf) -> Deviations:
     """Each result against the others that agree.
 
     The result that deviates most is removed from the mean of the others, until none that is left
@@ -236,12 +208,12 @@ def _sums_of_others(values: Array) -> Array:
     return before + after
 
 
-def _agreeing(poses: Poses, limits: Limits) -> Mask:
+def _agreeing(poses: Poses, limits: LimitsOf) -> Mask:
     """(n,) the results that are left, one at least."""
     kept = np.ones(len(poses), np.bool_)
     while np.count_nonzero(kept) > 1:
         deviation, covariance, freedom = _leave_one_out(poses, kept)
-        beyond = kept & limits.are_exceeded(deviation, covariance, freedom)
+        beyond = kept & limits(freedom).exceeded(deviation, covariance).any(axis=1)
         if not beyond.any():
             break
         # Decrease of the chi-squared of the rest when each result is removed.
@@ -251,14 +223,15 @@ def _agreeing(poses: Poses, limits: Limits) -> Mask:
     return kept
 
 
-def _ambiguous_pairs(poses: Poses, agreeing: Mask, limits: Limits) -> Mask:
+def _ambiguous_pairs(poses: Poses, agreeing: Mask, limits: LimitsOf) -> Mask:
     """(n, n) pairs of a removed result and one that is left, where the rest agrees either way."""
     ambiguous = np.zeros((len(poses), len(poses)), np.bool_)
     for removed in np.flatnonzero(~agreeing):
         for left in np.flatnonzero(agreeing):
             swapped = agreeing.copy()
             swapped[[removed, left]] = True, False
-            beyond = swapped & limits.are_exceeded(*_leave_one_out(poses, swapped))
+            deviation, covariance, freedom = _leave_one_out(poses, swapped)
+            beyond = swapped & limits(freedom).exceeded(deviation, covariance).any(axis=1)
             ambiguous[removed, left] = ambiguous[left, removed] = not beyond.any()
     return ambiguous
 

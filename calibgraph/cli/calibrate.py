@@ -175,7 +175,7 @@ def solve(
     with progress_bar("solving"), checked_arguments():
         seen = None if camera_matches is None else load_camera_matches(camera_matches)
         result = solve(load_rig(rig), correspondences, settings, rare.terms, camera_matches=seen)
-        result = result.with_inputs({str(correspondences): sha256(correspondences)})
+        result = replace(result, inputs={str(correspondences): sha256(correspondences)})
         result = _warned_of_same_data(result, rig)
         written = write_result(result, out)
     if print_graph:
@@ -234,23 +234,17 @@ def _print_and_exit(result: Calibration, written: list[Path], *, as_json: bool) 
 
 def track(
     rig: Path = Argument(..., metavar="RIG", help="Rig with the initial guess."),
-    source: list[Path] = Argument(
+    source: str = Argument(
         ...,
-        metavar="SOURCE...",
+        metavar="TABLE",
         help="Table of correspondences (.parquet, .csv), or - for standard input (a JSON line per "
-        "frame). With --matcher: datasets or ROS bags of one rig, as one drive.",
+        "frame).",
     ),
     out: Path = Option(
         Path("tracking"),
         metavar="DIR",
         help="Folder for the state and the result. A state in it is resumed.",
     ),
-    step: int = Option(1, min=1, help="With --matcher: match every N-th frame only."),
-    matcher: str | None = Option(None, metavar="NAME", help="Match frames: structure or cmrnext."),
-    interval_s: options.IntervalS = None,
-    topic: options.Topic = None,
-    motion: options.Motion = None,
-    weights: options.Weights = None,
     config: options.ConfigFile = None,
     seed: options.SeedOrConfig = None,
 ) -> None:
@@ -263,42 +257,18 @@ def track(
 
     Frames of one place (within some 20 m) share errors: name it in each line ("place") or list the
     frames of each in the table ("places"). Otherwise all are of one place, and the error bar stays
-    as wide. With --matcher structure places are found from the images.
+    as wide. Tables of `calibgraph match` list them.
     """
     from calibgraph.cli.settings import read_settings
     from calibgraph.io.rigs import load_rig
     from calibgraph.model.result_files import require_result_folder
-    from calibgraph.tracking.command import open_drive, track
+    from calibgraph.tracking.command import track
     from calibgraph.tracking.state import require_poses_alone
 
-    require_result_folder(out, [rig, *source])
+    require_result_folder(out, [rig, Path(source)])
     with checked_arguments():
-        settings, rare = read_settings(config, seed=seed)
+        settings, _ = read_settings(config, seed=seed)
         require_poses_alone(settings)
-        if matcher is None:
-            given = {"--interval-s": interval_s, "--topic": topic or None, "--motion": motion,
-                     "--weights": weights, "--step": None if step == 1 else step}  # fmt: skip
-            _require_matcher_for(source, given | rare.of_cmrnext)
-            chosen = None
-        else:
-            chosen = matcher_from(matcher, weights, seed=settings.seed, of_cmrnext=rare.of_cmrnext)
-    guess, drive = load_rig(rig), None
-    if chosen is not None:
-        bag = bag_options_from(topic, motion=motion, **rare.of_bags)
-        drive = open_drive(
-            source, guess, settings, matcher=chosen, every=step, interval_s=interval_s, bag=bag
-        )
-    result, written = track(guess, source, config=settings, out=out, notify=print_line, drive=drive)
+    guess = load_rig(rig)
+    result, written = track(guess, source, config=settings, out=out, notify=print_line)
     _print_and_exit(result, written, as_json=False)
-
-
-def _require_matcher_for(source: list[Path], given: dict[str, object]) -> None:
-    """Refuse what is for clouds and images without a matcher: tables bring their motion."""
-    from calibgraph.model.clock import OF_TABLES
-
-    for name, value in given.items():
-        if value is not None:
-            motion = f"; give {OF_TABLES}" if name in ("--interval-s", "--motion") else ""
-            raise ValueError(f"{name} goes with --matcher only{motion}")
-    if len(source) > 1:
-        raise ValueError(f"{len(source)} sources given; several go with --matcher only")

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import json
-from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from shlex import join
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import typer
 from typer import Argument, Option
@@ -22,40 +21,24 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-_PAGES = (".html", ".htm")
-
-
 def report(
     result: Path = Argument(..., metavar="RESULT", help="Its folder, or its calibration.yaml."),
     out: Path | None = Option(
-        None, metavar="FILE.html", help="Page. (default: report.html beside, or none with --mcap)"
+        None, metavar="FILE.html", help="Page. (default: report.html beside the result)"
     ),
-    mcap: Path | None = Option(None, metavar="FILE.mcap", help="Recording for Foxglove or Rerun."),
     force: options.Force = False,
 ) -> None:
-    """Show a result: as one HTML page that opens without a network, or as a recording.
-
-    The recording shows clouds, images and projected points, before and after.
-    """
+    """Show a result as one HTML page that opens without a network."""
     from calibgraph.files import require_new_file
     from calibgraph.io.calibrations import load_calibration
     from calibgraph.model.result_files import REPORT_FILE
     from calibgraph.report.html import write_report
 
-    for path, suffixes in ((out, _PAGES), (mcap, (".mcap",))):
-        if path is not None:
-            require_new_file(path, *suffixes, force=force)
-    loaded, written = load_calibration(result), []
-    if out is not None or mcap is None:
-        folder = result if result.is_dir() else result.parent
-        written.append(write_report(loaded, out or folder / REPORT_FILE))
-    if mcap is not None:
-        from calibgraph.report.mcap_file import write_mcap
-
-        with progress_bar("reading") as progress:
-            written.append(write_mcap(loaded, mcap, progress=progress))
-    for path in written:
-        print_line(f"{path}: written; the verdict is {loaded.verdict.status}")
+    if out is not None:
+        require_new_file(out, ".html", ".htm", force=force)
+    loaded, folder = load_calibration(result), result if result.is_dir() else result.parent
+    path = write_report(loaded, out or folder / REPORT_FILE)
+    print_line(f"{path}: written; the verdict is {loaded.verdict.status}")
 
 
 def evaluate(
@@ -174,20 +157,7 @@ def weights(
         print_weights(terminal(), checkpoint.summary(), out)
 
 
-_LIST = "list"
-
-
-def _list_formats(format: str) -> str:
-    """Print the formats for ``--format list``, before other arguments are required."""
-    if format == _LIST:
-        from calibgraph.report.as_json import print_line
-
-        width = max(map(len, EXPORT_FORMATS))
-        lines = (f"{name:{width}}  {meaning}" for name, meaning in EXPORT_FORMATS.items())
-        with suppress(BrokenPipeError):
-            print_line("\n".join(lines))
-        raise typer.Exit
-    return format
+_FORMATS = "; ".join(f"{name}: {meaning}" for name, meaning in EXPORT_FORMATS.items()) + "."
 
 
 def export(
@@ -197,9 +167,7 @@ def export(
     format: str = Option(
         ...,
         metavar="FORMAT",
-        callback=_list_formats,
-        is_eager=True,
-        help=f"{', '.join(EXPORT_FORMATS)}; list: what these are.",
+        help=_FORMATS,
     ),
     out: Path = Option(..., metavar="FILE", help="File to write; of camera_info a folder."),
     camera: list[str] | None = Option(
@@ -272,64 +240,42 @@ def _parse_pose(text: str) -> NDArray[np.float64]:
 
 
 STREET = "street"
-RIG, BEAMS, STEP_M = "kitti", 64, 4.0  # defaults of simulate_street, but for the rig
-_PANEL = "Scenario street"
 
 
 def simulate(
     scenario: str = Argument(
         ...,
         metavar="SCENARIO",
-        help="street: a dataset of scans and images of a drive along a procedural street. "
-        "kitti, walkley: a table of correspondences, with the errors of the paper's matcher.",
+        help="street: a dataset of scans and images of a drive along a procedural street.",
     ),
     out: Path = Option(..., metavar="DIR", help="Folder to write."),
     frames: int = Option(10, help="Number of frames."),
     rotation_deg: float = Option(5.0, min=0, help="Rotation error of the guess, rig.yaml."),
     translation_m: float = Option(0.3, min=0, help="Translation error of the guess."),
     seed: options.Seed = 0,
-    rig: str | None = Option(
-        None,
+    rig: str = Option(
+        "kitti",
         metavar="NAME|RIG",
-        rich_help_panel=_PANEL,
         help="kitti, walkley (stereo pairs), surround (six cameras), fisheye (four), omni "
-        "(two that see more than a half-space), panorama (one that sees all round), sample "
-        f"(three small ones), or a rig file; its extrinsics are the truth. (default: {RIG})",
+        "(two that see more than a half-space), sample (three small ones), or a rig file; its "
+        "extrinsics are the truth.",
     ),
-    beams: int | None = Option(
-        None,
-        metavar="16|32|64|128",
-        rich_help_panel=_PANEL,
-        help=f"Of the LiDAR. (default: {BEAMS})",
-    ),
-    step_m: float | None = Option(
-        None, rich_help_panel=_PANEL, help=f"Mean distance between frames. (default: {STEP_M:g})"
-    ),
+    beams: int = Option(64, metavar="16|32|64|128", help="Of the LiDAR."),
+    step_m: float = Option(4.0, help="Mean distance between frames."),
 ) -> None:
     """Simulate data with a known truth, reference.yaml, and a displaced guess, rig.yaml."""
     from calibgraph.io.rigs import load_rig
     from calibgraph.simulation.recording import simulate_street
     from calibgraph.simulation.rigs import RIG_NAMES, rig_of
-    from calibgraph.simulation.scenarios import SCENARIOS, simulate_table
 
-    common: dict[str, Any] = {
-        "frames": frames, "rotation_deg": rotation_deg, "translation_m": translation_m, "seed": seed
-    }  # fmt: skip
-    given: dict[str, Any] = {"rig": rig, "beams": beams, "step_m": step_m}
-    street = {name: value for name, value in given.items() if value is not None}
     with progress_bar() as progress, checked_arguments():
-        if scenario == STREET:
-            name = street.pop("rig", RIG)
-            is_file = name not in RIG_NAMES and name and Path(name).exists()
-            truth = load_rig(name) if is_file else rig_of(name)
-            written = simulate_street(out, truth, **street, **common, progress=progress)
-        elif street and scenario in SCENARIOS:
-            named = " and ".join(f"--{name.replace('_', '-')}" for name in street)
-            raise ValueError(
-                f"scenario {scenario!r} has its own rig and matcher, {named} would change nothing; "
-                f"leave it out, or simulate {STREET!r}"
-            )
-        else:
-            written = simulate_table(out, scenario, **common)
+        if scenario != STREET:
+            raise ValueError(f"unknown scenario {scenario!r}; known is {STREET}")
+        is_file = rig not in RIG_NAMES and rig and Path(rig).exists()
+        written = simulate_street(
+            out, load_rig(rig) if is_file else rig_of(rig), beams=beams, frames=frames,
+            step_m=step_m, seed=seed, rotation_deg=rotation_deg, translation_m=translation_m,
+            progress=progress,
+        )  # fmt: skip
     for path in written:
         print_line(f"{path}: written")

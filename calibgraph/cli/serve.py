@@ -37,10 +37,8 @@ def serve(
     tokens: Path | None = Option(
         None, metavar="FILE", help="Who may call. (default: anyone on this machine)"
     ),
-    new_token: str | None = Option(
-        None,
-        metavar="read|submit",
-        help="Add a token to the file of --tokens, print it, and end.",
+    new_token: bool = Option(
+        False, "--new-token", help="Add a token to the file of --tokens, print it, and end."
     ),
     host_name: list[str] | None = Option(
         None, metavar="NAME", help="Name the server is called by; may be repeated."
@@ -68,8 +66,8 @@ def serve(
     from calibgraph.service.app import serve as serve_app
     from calibgraph.service.requests import Settings
 
-    if new_token is not None:
-        _add_token(tokens, new_token)
+    if new_token:
+        _add_token(tokens)
         return
     require_safe(host, has_tokens=tokens is not None)
     counted = {} if jobs is None else {"jobs_at_once": jobs}
@@ -94,23 +92,19 @@ def _announce(url: str, tokens: Path | None) -> None:
     if tokens is not None:
         needed = (
             f"it asks for a token of {tokens} as the password; one is made by "
-            f"calibgraph serve --tokens {quote(str(tokens))} --new-token submit"
+            f"calibgraph serve --tokens {quote(str(tokens))} --new-token"
         )
     print_line(f"open {url} in a browser: {needed}")
 
 
-def _add_token(path: Path | None, scope: str) -> None:
+def _add_token(path: Path | None) -> None:
     """Make a token and print it: the file keeps its hash only."""
-    from calibgraph.service.request_guard import SCOPES, add_token
+    from calibgraph.service.request_guard import add_token
 
     if path is None:
         raise CalibrationError("--new-token: give --tokens FILE, the file that it is added to")
-    for each in SCOPES:
-        if scope == each:
-            print(add_token(path, each))
-            print_line(f"{path}: a token with scope {scope} was added")
-            return
-    raise CalibrationError(f"--new-token {scope}: known are {', '.join(SCOPES)}")
+    print(add_token(path))
+    print_line(f"{path}: a token was added")
 
 
 def pick(

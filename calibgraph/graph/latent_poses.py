@@ -2,8 +2,9 @@
 
     prior         o at the identity, d at zero, each by its variance components
     distortion    d by the residuals of the matches, which no pose can follow
-    alignment     x_c to y_c, displaced by the scan distortion d, exactly
-    camera        y_c to m_c; x_c to n_c, displaced by the scan distortion as pairs see it
+    camera        x_c to m_c, displaced by the scan distortion d as matches see it; x_c to n_c,
+                  as pairs see it
+    alignment     x_c to y_c, displaced as m_c, exactly; in the graph that is printed
     place         o to o_p, and m_c to a_cp, with a robust loss
     data          correspondences of camera c at place p, on o_p and a_cp;
                   camera-to-camera matches at place p, on o_p, n_a and n_b
@@ -12,7 +13,8 @@
 
 What is reported is y_c, the alignment: the pose that puts the points, as this sensor delivers them,
 on this camera's image. The mount x_c is where the sensor is; what is unknown of its beams is added.
-Images show relative poses of cameras without the cloud, so these are of mounts.
+Images show relative poses of cameras without the cloud, so these are of mounts. What may err of
+lens and clock, and is not estimated, is considered: it widens what is reported.
 
 The names are those of ``calibgraph.graph.variables``. Without errors of sensor and matcher all
 poses of a camera are equal, and the graph is that of Eq. 5 of the paper.
@@ -27,6 +29,7 @@ from functools import cached_property
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from calibgraph.arrays import Array
 from calibgraph.graph.by_place import (
@@ -40,7 +43,6 @@ from calibgraph.graph.variables import (
     CLOUD,
     DISTORTION,
     aligned_key,
-    body_key,
     camera_key,
     cloud_at_key,
     lens_key,
@@ -50,6 +52,7 @@ from calibgraph.graph.variables import (
     seen_lens_key,
 )
 from calibgraph.model.config import Reported
+from calibgraph.model.geometry import adjoints, retract_all
 from factors import (
     displaced_between_factor,
     placed_factor,
@@ -70,9 +73,8 @@ class LatentPoseModel:
         components: of the errors.
         of: the poses that are reported.
         lenses: those that are estimated, by the numbers of their cameras.
-        lens_errors: by the numbers of cameras, (6, 6) covariance of ``b_c``, which is then
-            reported, about the mount or alignment: of the pose that follows what is not estimated
-            of lens and clock.
+        lens_errors: by the numbers of cameras, (6, 6) covariance of what is reported by what is
+            considered of lens and clock.
         frames: the numbers of the frames of each place.
     """
 
@@ -97,24 +99,26 @@ class LatentPoseModel:
         return [camera_key(number) for number in range(len(self.cameras))]
 
     @cached_property
-    def aligned(self) -> dict[int, Array]:
-        """Per camera whose alignment differs from its mount, the (6, B) displacement by ``d``."""
-        parts = self.components
-        if not self.is_distorted:
-            return {}
-        pairs = {number: parts.pair_distortion_jacobian[number] for number in self.paired}
-        return pairs | {number: parts.distortion_jacobian[number] for number in self.matched}
+    def alignment(self) -> Array:
+        """(N, 6, B) displacement of alignments from mounts by ``d``; of unmatched, as of pairs."""
+        found = self.components.pair_distortion_jacobian.copy()
+        found[self.matched] = self.components.distortion_jacobian[self.matched]
+        return found
 
-    @cached_property
-    def reported_keys(self) -> list[int]:
-        """Keys of the poses that are reported, in the order of the cameras."""
-        numbers = range(len(self.cameras))
-        return [body_key(n) if n in self.lens_errors else self.fitted_key(n) for n in numbers]
-
-    def fitted_key(self, number: int) -> int:
-        """Key of the mount or the alignment of a camera, as the lens of the rig has it."""
-        is_aligned = self.of == "alignment" and number in self.aligned
-        return aligned_key(number) if is_aligned else camera_key(number)
+    def reported(self, values: gtsam.Values, of: Reported) -> tuple[Array, Array]:
+        """(N, 4, 4) T_camera_lidar of mounts or alignments; (6 N, n) derivative by all columns."""
+        mounts = [values.atPose3(key).inverse().matrix() for key in self.camera_keys]
+        T, rows = np.array(mounts), np.zeros((6 * len(mounts), self.size))
+        at = self.columns_of(self.camera_keys)
+        rows[np.arange(len(rows)), at] = 1.0
+        if of == "mount" or not self.is_distorted:
+            return T, rows
+        away = self.alignment @ values.atVector(DISTORTION)
+        turn = adjoints(retract_all(np.tile(np.eye(4), (len(T), 1, 1)), away))
+        rows[:, at] = block_diag(*turn)
+        by_distortion = right_jacobians(away) @ self.alignment
+        rows[:, self.columns[DISTORTION]] = by_distortion.reshape(len(rows), -1)
+        return retract_all(T, away), rows
 
     def lens_keys(self, number: int) -> list[int]:
         """Key of ``s_c``, if the lens of the camera is estimated."""
@@ -156,8 +160,8 @@ class LatentPoseModel:
 
     @cached_property
     def shared_graph(self) -> gtsam.NonlinearFactorGraph:
-        """The factors of what all places share: of errors, ties, pose graph, lenses."""
-        return join(self.error_graph, self.tie_graph, self.pose_graph, self.lens_graph)
+        """The factors of what all places share: of errors, pose graph, lenses."""
+        return join(self.error_graph, self.pose_graph, self.lens_graph)
 
     @cached_property
     def lens_graph(self) -> gtsam.NonlinearFactorGraph:
@@ -171,29 +175,15 @@ class LatentPoseModel:
         graph.add(gtsam.PriorFactorPose3(CLOUD, gtsam.Pose3(), _noise(parts.cloud)))
         if self.is_distorted:
             graph.push_back(_distortion_graph(parts))
-        seen = aligned_key if self.is_distorted else camera_key
         for number in self.matched:
-            edge, noise = (seen(number), matched_key(number)), _noise(parts.camera)
-            if (term := self.lenses.get(number)) is None:
-                graph.add(gtsam.BetweenFactorPose3(*edge, gtsam.Pose3(), noise))
-            else:
-                shifts = term.shifts(number, is_distorted=self.is_distorted)
-                graph.add(displaced_between_factor(*edge, shifts, noise))
+            shifts = {DISTORTION: self.alignment[number]} if self.is_distorted else {}
+            if (term := self.lenses.get(number)) is not None:
+                shifts = term.displace(number, shifts)
+            graph.add(_tie(camera_key(number), matched_key(number), shifts, parts.camera))
         for number in self.paired:
-            edge = camera_key(number), paired_key(number)
-            graph.add(_displaced(self, edge, parts.pair_distortion_jacobian[number], parts.pairs))
-        return graph
-
-    @cached_property
-    def tie_graph(self) -> gtsam.NonlinearFactorGraph:
-        """Those of the poses that are reported: x_c to y_c, and these to b_c."""
-        graph = gtsam.NonlinearFactorGraph()
-        for number, jacobian in self.aligned.items():
-            edge = camera_key(number), aligned_key(number)
-            graph.add(_displaced(self, edge, jacobian, EXACT**2 * np.eye(6)))
-        for number, covariance in self.lens_errors.items():
-            edge = self.fitted_key(number), body_key(number)
-            graph.add(gtsam.BetweenFactorPose3(*edge, gtsam.Pose3(), _noise(covariance)))
+            seen = parts.pair_distortion_jacobian[number]
+            shifts = {DISTORTION: seen} if self.is_distorted else {}
+            graph.add(_tie(camera_key(number), paired_key(number), shifts, parts.pairs))
         return graph
 
     @cached_property
@@ -224,9 +214,9 @@ class LatentPoseModel:
     def shared_keys(self) -> list[int]:
         """Keys of the variables that no place has of its own; the touched ones first."""
         distortion = [DISTORTION] if self.is_distorted else []
-        poses = [*self.camera_keys, *map(aligned_key, self.aligned)]
-        bodies = map(body_key, self.lens_errors)
-        return [*self.touched_keys, *map(lens_key, self.lenses), *distortion, *poses, *bodies]
+        return [
+            *self.touched_keys, *map(lens_key, self.lenses), *distortion, *self.camera_keys
+        ]  # fmt: skip
 
     @cached_property
     def columns(self) -> dict[int, NDArray[np.intp]]:
@@ -267,11 +257,15 @@ class LatentPoseModel:
 
 
 def latent_pose_graph(model: LatentPoseModel) -> gtsam.NonlinearFactorGraph:
-    """The whole graph; its optimum and its marginal are what is reported.
+    """The whole graph; its optimum is reported, and its marginal with what is considered.
 
     ``2 * graph.error(values)`` is the cost.
     """
-    return join(model.shared_graph, model.place_graph, data_graph(model))
+    graph = join(model.shared_graph, model.place_graph, data_graph(model))
+    for number, jacobian in enumerate(model.alignment if model.is_distorted else ()):
+        edge, exact = (camera_key(number), aligned_key(number)), EXACT**2 * np.eye(6)
+        graph.add(_tie(*edge, {DISTORTION: jacobian}, exact))
+    return graph
 
 
 def data_graph(model: LatentPoseModel) -> gtsam.NonlinearFactorGraph:
@@ -293,14 +287,25 @@ def to_ordering(keys: Iterable[int]) -> gtsam.Ordering:
     return gtsam.Ordering([*keys])
 
 
-def _displaced(
-    model: LatentPoseModel, edge: tuple[int, int], jacobian: Array, covariance: Array
+def _tie(
+    one: int, two: int, shifts: Mapping[int, Array], covariance: Array
 ) -> gtsam.NonlinearFactor:
-    """From a camera to where its data show it, displaced by the scan distortion."""
+    """From a camera to where its data show it, displaced by vectors."""
     noise = _noise(covariance)
-    if not model.is_distorted:
-        return gtsam.BetweenFactorPose3(*edge, gtsam.Pose3(), noise)
-    return displaced_between_factor(*edge, {DISTORTION: jacobian}, noise)
+    if shifts:
+        return displaced_between_factor(one, two, shifts, noise)
+    return gtsam.BetweenFactorPose3(one, two, gtsam.Pose3(), noise)
+
+
+def right_jacobians(twists: Array) -> Array:
+    """(f, 6, 6) derivatives of Exp(-xi) Exp(xi + d) by d, of (f, 6) small xi, to fourth order."""
+    ad = np.zeros((len(twists), 6, 6))
+    for first, (x, y, z) in ((0, twists[:, :3].T), (3, twists[:, 3:].T)):
+        ad[:, first + 2, 1], ad[:, first, 2], ad[:, first + 1, 0] = x, y, z
+        ad[:, first + 1, 2], ad[:, first + 2, 0], ad[:, first, 1] = -x, -y, -z
+    ad[:, 3:, 3:] = ad[:, :3, :3]
+    square = ad @ ad
+    return np.asarray(np.eye(6) - ad / 2 + square / 6 - square @ ad / 24)
 
 
 def _distortion_graph(parts: VarianceComponents) -> gtsam.NonlinearFactorGraph:

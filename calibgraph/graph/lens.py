@@ -30,7 +30,7 @@ from calibgraph.model.lens import IN_DOUBT, LensSigmas
 from calibgraph.model.rig import Camera, Rig
 from factors import Columns, cauchy_noise, linear_factor
 from factors.columns import CENTRE_X, CENTRE_Y, CLOCK, COEFFICIENT_NUMBERS, FOCAL, OFFSET, READOUT
-from factors.lens_kernels import EQUIRECTANGULAR, PINHOLE
+from factors.lens_kernels import PINHOLE
 
 TANGENTIAL_SHARE = 0.1
 _TAIL_SIGMAS = 2.0  # where the Cauchy loss of a prior bends
@@ -125,18 +125,8 @@ def _prior_sigmas(camera: Camera, default: LensSigmas) -> dict[LensPart, dict[st
 
 
 def lens_variables(rig: Rig, parts: Sequence[LensPart]) -> dict[str, LensVariable]:
-    """Per camera its variable; of panoramas, whose format determines the lens, the clock alone.
-
-    Raises:
-        ValueError: if there is none.
-    """
-    of_clock: list[LensPart] = [part for part in parts if part in CLOCK]
-    chosen: dict[str, Sequence[LensPart]] = {
-        n: of_clock if c.lens.kind == EQUIRECTANGULAR else parts for n, c in rig.cameras.items()
-    }
-    if not any(chosen.values()):
-        raise ValueError("equirectangular cameras have no lens to estimate")
-    return {n: LensVariable.of(rig.cameras[n], own) for n, own in chosen.items() if own}
+    """Per camera its variable."""
+    return {name: LensVariable.of(camera, parts) for name, camera in rig.cameras.items()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,11 +146,11 @@ class LensTerm:
     by_distortion: Array
     compensating: Array
 
-    def shifts(self, number: int, *, is_distorted: bool) -> dict[int, Array]:
-        """By key, the (6, ...) displacements of m_c by l_c, s_c and the scan distortion."""
+    def displace(self, number: int, shifts: Mapping[int, Array]) -> dict[int, Array]:
+        """By key, the (6, ...) displacements of m_c, with those by l_c and s_c."""
         B = self.compensating
-        lens = {lens_key(number): -B, seen_lens_key(number): B}
-        return lens | ({DISTORTION: -B @ self.by_distortion} if is_distorted else {})
+        bent = {key: shift - B @ self.by_distortion for key, shift in shifts.items()}
+        return {lens_key(number): -B, seen_lens_key(number): B, **bent}
 
 
 def lens_graph(lenses: Mapping[int, LensTerm], *, is_distorted: bool) -> gtsam.NonlinearFactorGraph:

@@ -2,8 +2,7 @@
 
 x_c   the mount of camera c: ``T_lidar_camera`` of the two sensors as bodies
 d     the scan distortion, in standard deviations of its prior
-y_c   the alignment of camera c: where the points, as the LiDAR delivers them, meet its image
-b_c   the mount of camera c if its lens errs as that of a calibrated one, where mounts are reported
+y_c   its alignment: where the points, as the LiDAR delivers them, meet its image; printed alone
 m_c   camera c as its matches show it at every place
 n_c   camera c as its pairs with other cameras show it
 o     the cloud as it is displaced at every place
@@ -32,9 +31,9 @@ def _keys_of(letter: str) -> Key:
     return lambda number: int(gtsam.symbol(letter, number))
 
 
-camera_key, aligned_key, body_key, matched_key = map(_keys_of, "xybm")
-paired_key, lens_key, seen_lens_key, cloud_at_key = map(_keys_of, "nlsp")
-"""Of ``x_c``, ``y_c``, ``b_c``, ``m_c``, ``n_c``, ``l_c``, ``s_c`` and ``o_p``."""
+camera_key, aligned_key, matched_key, paired_key = map(_keys_of, "xymn")
+lens_key, seen_lens_key, cloud_at_key = map(_keys_of, "lsp")
+"""Of ``x_c``, ``y_c``, ``m_c``, ``n_c``, ``l_c``, ``s_c`` and ``o_p``."""
 
 
 def matched_at_key(place: int, camera: int) -> int:

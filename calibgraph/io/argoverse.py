@@ -12,13 +12,10 @@ import numpy as np
 
 from calibgraph.errors import DatasetError, FileError
 from calibgraph.files import checked_model
-from calibgraph.io.frame_files import (
-    FrameFiles,
-    IncompleteCamera,
-    PublishedFolder,
-    files_by_stem,
-)
+from calibgraph.io.frame import Frame
+from calibgraph.io.frame_files import files_by_stem
 from calibgraph.io.images import IMAGE_SUFFIXES
+from calibgraph.io.published import IncompleteCamera, PublishedFolder
 from calibgraph.io.rig_parts import pose_of_quaternion
 from calibgraph.io.tables import read_feather
 from calibgraph.model.geometry import invert
@@ -74,7 +71,7 @@ def _row(path: Path, name: str, columns: Sequence[str]) -> dict[str, Any]:
     return {key: values[names.index(name)].item() for key, values in table.items()}
 
 
-def _frames(log: Path, cameras: Sequence[str]) -> list[FrameFiles]:
+def _frames(log: Path, cameras: Sequence[str]) -> list[Frame]:
     """The sweeps that have an image of every camera, in order of time."""
     sweeps = _stamped(log / _LIDAR, (".feather",))
     stamps = np.array(list(sweeps))
@@ -84,7 +81,7 @@ def _frames(log: Path, cameras: Sequence[str]) -> list[FrameFiles]:
         others = np.array(list(found))
         nearest[name] = others[np.abs(np.subtract.outer(stamps, others)).argmin(axis=1)]
     frames = [
-        FrameFiles(str(stamp), cloud, {n: images[n][int(nearest[n][i])] for n in cameras})
+        Frame(i, str(stamp), cloud, {n: images[n][int(nearest[n][i])] for n in cameras})
         for i, (stamp, cloud) in enumerate(sweeps.items())
         if all(abs(nearest[n][i] - stamp) <= _APART_NS for n in cameras)
     ]

@@ -40,6 +40,7 @@ from calibgraph.io.bags.transforms import (
 )
 from calibgraph.io.clouds import time_fields
 from calibgraph.io.frame import Frame, ScanMotion, seconds_between, twist_between, twist_by_scans
+from calibgraph.io.rig_parts import Link
 from calibgraph.model.geometry import transform
 from calibgraph.model.rig import Camera
 
@@ -159,13 +160,13 @@ def _odometry(bag: Bag, lidar: str, options: BagOptions) -> Iterator[tuple[int, 
 def _moving_transforms(bag: Bag, lidar: str, options: BagOptions) -> Iterator[tuple[int, Array]]:
     """Stamps and T_parent_lidar of the /tf transforms of a frame that the LiDAR hangs from."""
     transforms = Transforms(open_drive(bag, options.beside))
-    for each in stamped_transforms(bag, MOVING):
+    for stamp_ns, child, link in stamped_transforms(bag, MOVING):
         if not transforms.moving:  # the vehicle stands
-            yield each.stamp_ns, np.eye(4)
-        elif each.child in transforms.moving and each.T_parent_child is not None:
-            T_child_lidar = transforms.between(each.child, lidar)
+            yield stamp_ns, np.eye(4)
+        elif child in transforms.moving and isinstance(link, Link):
+            T_child_lidar = transforms.between(child, lidar)
             if T_child_lidar is not None:
-                yield each.stamp_ns, each.T_parent_child @ T_child_lidar
+                yield stamp_ns, link.T_parent_child @ T_child_lidar
 
 
 _S = 1_000_000_000

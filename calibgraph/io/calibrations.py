@@ -5,12 +5,11 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
-import numpy as np
 from pydantic import AfterValidator, AliasPath, BaseModel, BeforeValidator, Field, StrictBool
 
 from calibgraph.arrays import Array
 from calibgraph.errors import FileError
-from calibgraph.files import checked_model, holds_truth_value, load_model, read_yaml, sha256
+from calibgraph.files import checked_model, load_model, read_yaml, sha256
 from calibgraph.io.tables import load_camera_matches, load_correspondences
 from calibgraph.model.calibration import Calibration, Residuals
 from calibgraph.model.config import FORMER_SETTINGS, Config, Reported, Terms
@@ -23,18 +22,22 @@ from calibgraph.model.result_files import (
     CORRESPONDENCES_FILE,
     is_calibration_file,
 )
-from calibgraph.model.rig import Finite, Rig, rigid_transform
-from calibgraph.model.verdict import Check, ErrorProbability, Status, Verdict
+from calibgraph.model.rig import (
+    LARGEST_VARIANCE,
+    Finite,
+    Rig,
+    covariance_matrix,
+    rigid_transform,
+)
+from calibgraph.model.verdict import Status, Verdict
 
 Table = TypeVar("Table")
 
 _POSE = 6  # numbers of one
-_LARGEST = 1e24  # of a covariance: that of a pose that nothing determines is smaller
 _MEASURED = (
-    "timings_s", "residuals", "rounds", "prior_share", "error_sources", "lens", "covariance",
+    "timings_s", "residuals", "rounds", "error_sources", "lens", "covariance",
     "joint_covariance", "pair_covariance", "lens_covariance", "sigmas",
 )  # fmt: skip
-_ROUNDING = 1e-6  # of correlations: other programs may write fewer digits
 
 
 def load_calibration(path: Path | str) -> Calibration:
@@ -54,14 +57,7 @@ def load_calibration(path: Path | str) -> Calibration:
     for key in _MEASURED:
         _require_possible(content.get(key), f"{path}: {key}")
     parts = checked_model(_Parts, content, path)
-    former = FORMER_SETTINGS.items()
-    settings = {key: value for key, value in parts.config.items() if (key, value) not in former}
     found = Calibration(
-        rig=checked_model(Rig, parts.rig, path),
-        initial_rig=checked_model(Rig, parts.initial_rig, path),
-        config=checked_model(Config, settings, path),
-        camera_verdicts=_verdicts(parts.camera_verdicts),
-        lidar_verdicts=_verdicts(parts.lidar_verdicts),
         lens_covariance={name: of.covariance for name, of in parts.lens_covariance.items()},
         frames=tuple(frame.model_dump(exclude_none=True) for frame in parts.frames_used),
         correspondences=_table(path, CORRESPONDENCES_FILE, content, load_correspondences),
@@ -77,48 +73,20 @@ def _require_possible(value: Any, where: str) -> None:
     if isinstance(value, (dict, list)):
         for key, each in value.items() if isinstance(value, dict) else enumerate(value):
             _require_possible(each, f"{where}.{key}")
-    elif isinstance(value, float) and not abs(value) <= _LARGEST:
+    elif isinstance(value, float) and not abs(value) <= LARGEST_VARIANCE:
         raise FileError(
             where, f"is {value}, no number of a result; the file was edited, write it again"
         )
 
 
-def _covariance(value: Any) -> Array:
-    """A covariance: a square matrix of finite numbers, symmetric, and of no negative variance."""
-    try:
-        found = np.array(value, np.float64)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise ValueError("expected a matrix of numbers") from error
-    if holds_truth_value(value):
-        raise ValueError("expected a matrix of numbers, found a truth value in it")
-    if found.ndim != 2 or len({*found.shape}) != 1 or not (np.abs(found) <= _LARGEST).all():  # noqa: PLR2004
-        raise ValueError(f"expected a square matrix of finite numbers, found {found.shape}")
-    variances = np.diag(found)
-    units = np.sqrt(np.where(variances > 0, variances, 1.0))
-    correlations = found / np.outer(units, units)
-    if not np.allclose(correlations, correlations.T, atol=_ROUNDING):
-        raise ValueError("it is not symmetric; the file was edited, write it again")
-    if (variances < 0).any() or np.linalg.eigvalsh(correlations)[0] < -_ROUNDING * len(found):
-        raise ValueError("it has negative variances; the file was edited, write it again")
-    return found
-
-
-def _of_poses(found: Array) -> Array:
-    if len(found) % _POSE:
-        raise ValueError(f"expected 6 rows for each pose, found {found.shape}")
-    return found
-
-
 def _of_one_pose(found: Array) -> Array:
-    if len(_of_poses(found)) != _POSE:
+    if len(found) != _POSE:
         raise ValueError(f"expected a 6x6 matrix, found {found.shape}")
     return found
 
 
-Matrix4 = Annotated[Any, BeforeValidator(rigid_transform)]
-LensCovariance = Annotated[Any, BeforeValidator(_covariance)]
-JointCovariance = Annotated[LensCovariance, AfterValidator(_of_poses)]
-Covariance = Annotated[LensCovariance, AfterValidator(_of_one_pose)]
+Matrix = Annotated[Any, BeforeValidator(covariance_matrix)]
+Covariance = Annotated[Matrix, AfterValidator(_of_one_pose)]
 
 
 class _Motion(BaseModel):
@@ -137,31 +105,28 @@ class _FrameEntry(BaseModel):
 
 class _JointOfLens(BaseModel):
     parameters: tuple[str, ...]
-    covariance: LensCovariance
+    covariance: Matrix
 
 
-class _Checks(BaseModel):
-    status: Status
-    checks: tuple[Check, ...]
-    error_probability: ErrorProbability | None = None
-
-
-def _verdicts(parts: Mapping[str, _Checks]) -> dict[str, Verdict]:
-    return {name: Verdict(of.checks, of.error_probability) for name, of in parts.items()}
+def _without_former(settings: Any) -> Any:
+    """Settings without those of earlier versions that changed nothing."""
+    former = FORMER_SETTINGS.items()
+    is_map = isinstance(settings, dict)
+    return {k: v for k, v in settings.items() if (k, v) not in former} if is_map else settings
 
 
 class _Parts(BaseModel):
     """The keys of a result's file that are read, with their types; the others repeat them."""
 
-    rig: dict[str, Any]
-    initial_rig: dict[str, Any]
-    config: dict[str, Any]
+    rig: Rig
+    initial_rig: Rig
+    config: Annotated[Config, BeforeValidator(_without_former)]
     covariance: dict[str, Covariance | None]
-    joint_covariance: JointCovariance | None
+    joint_covariance: Matrix | None
     pair_covariance: dict[str, Covariance]
-    stage1_T_camera_lidar: dict[str, Matrix4]
-    camera_verdicts: dict[str, _Checks]
-    lidar_verdicts: dict[str, _Checks] = {}
+    stage1_T_camera_lidar: dict[str, Annotated[Any, BeforeValidator(rigid_transform)]]
+    camera_verdicts: dict[str, Verdict]
+    lidar_verdicts: dict[str, Verdict] = {}
     residuals: dict[str, Residuals]
     weaknesses: dict[str, tuple[str, ...]]
     frames_used: tuple[_FrameEntry, ...]
@@ -172,7 +137,6 @@ class _Parts(BaseModel):
     counts: dict[str, dict[str, int]]
     timings_s: dict[str, float]
     terms: Terms
-    prior_share: dict[str, float]
     error_sources: dict[str, ErrorSources] = {}
     lens: dict[str, tuple[LensEstimate, ...]] = {}
     lens_covariance: dict[str, _JointOfLens] = {}
@@ -185,14 +149,13 @@ def _require_consistent(
     path: Path, content: Mapping[str, Any], parts: _Parts, found: Calibration
 ) -> None:
     """Check that the verdict follows from its checks, and all parts are of the same cameras."""
-    verdict = content.get("verdict", {})
-    status = verdict.get("status") if isinstance(verdict, dict) else verdict
-    verdicts = [("the rig", status, found.verdict.status)] + [
-        (f"{kind} {name!r}", each.status, found.verdicts[name].status)
-        for kind, of in (("camera", parts.camera_verdicts), ("LiDAR", parts.lidar_verdicts))
-        for name, each in of.items()
-    ]
-    for what, stated, derived in verdicts:
+    verdicts = [("the rig", content.get("verdict"), found.verdict)]
+    for kind, key in (("camera", "camera_verdicts"), ("LiDAR", "lidar_verdicts")):
+        of_kind = content.get(key, {}).items()
+        verdicts += [(f"{kind} {name!r}", each, found.verdicts[name]) for name, each in of_kind]
+    for what, written, verdict in verdicts:
+        stated = written.get("status") if isinstance(written, dict) else written
+        derived = verdict.status
         if stated != derived:
             raise FileError(
                 path,
@@ -203,10 +166,6 @@ def _require_consistent(
     right = {part: names == {*getattr(found, part)} for part in _OF_ALL_CAMERAS}
     right |= {part: names >= {*getattr(found, part)} for part in _OF_SOME_CAMERAS}
     right["counts"] &= all("used" in of_camera for of_camera in found.counts.values())
-    right["sigmas"] = all(
-        covariance is None or _is_whole(content.get("sigmas"), name)
-        for name, covariance in found.covariance.items()
-    )
     measured = {
         name for name, lidar in (found.rig.lidars or {}).items() if lidar.covariance is not None
     }
@@ -222,25 +181,11 @@ def _require_consistent(
         raise FileError(path, f"its {part} are not of the cameras of its rig; write it again")
 
 
-def _is_whole(sigmas: Any, camera: str) -> bool:
-    """Whether the sigmas of a file, which repeat the covariances, have three numbers each."""
-    found = sigmas.get(camera) if isinstance(sigmas, dict) else None
-    return isinstance(found, dict) and [len(each) for each in found.values()] == [3, 3]
-
-
 _OF_ALL_CAMERAS = ("covariance", "camera_verdicts", "counts")
 _OF_SOME_CAMERAS = (
-    "residuals", "stage1_T_camera_lidar", "weaknesses", "prior_share", "error_sources", "lens",
+    "residuals", "stage1_T_camera_lidar", "weaknesses", "error_sources", "lens",
 )  # fmt: skip
-_OTHERWISE = {
-    "rig",
-    "initial_rig",
-    "config",
-    "camera_verdicts",
-    "lidar_verdicts",
-    "lens_covariance",
-}
-_PLAIN = {f.name for f in fields(Calibration)} & _Parts.model_fields.keys() - _OTHERWISE
+_PLAIN = {f.name for f in fields(Calibration)} & _Parts.model_fields.keys() - {"lens_covariance"}
 """The parts that are those of a calibration as they are."""
 
 

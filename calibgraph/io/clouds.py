@@ -502,20 +502,15 @@ def describe_thinned(sizes: Iterable[int]) -> list[str]:
     ]
 
 
-def read_cloud(path: Path, columns: Sequence[str] | None = None) -> RawCloud:
-    """All points of a file, and the names of its fields."""
+def read_returns(path: Path, columns: Sequence[str] | None = None) -> RawCloud:
+    """The points of a file that are returns, and the names of its fields."""
     if require_file(path).stat().st_size > MAX_CLOUD_BYTES:
         raise FileError(path, f"{path.stat().st_size} bytes is too large for one cloud")
     if path.suffix.lower() not in _READERS:
         raise FileError(path, f"unknown cloud format; known are {', '.join(CLOUD_SUFFIXES)}")
-    if path.suffix.lower() == ".bin":
-        return read_bin(path, columns)
-    return _READERS[path.suffix.lower()](path)
-
-
-def read_returns(path: Path, columns: Sequence[str] | None = None) -> RawCloud:
-    """The points of a file that are returns, and the names of its fields."""
-    return only_returns(read_cloud(path, columns), path)
+    is_bin = path.suffix.lower() == ".bin"
+    found = read_bin(path, columns) if is_bin else _READERS[path.suffix.lower()](path)
+    return only_returns(found, path)
 
 
 def only_returns(cloud: RawCloud, path: Path | str) -> RawCloud:

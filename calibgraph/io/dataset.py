@@ -194,22 +194,20 @@ def _frames_of_files(
     complete: bool, tolerance_s: float, interval_s: float | None,
 ) -> FoundFrames:  # fmt: skip
     """The frames of a folder; the complete ones where names are stamps."""
-    files, pairing = frames_of_folder(
+    found, pairing = frames_of_folder(
         path, [*rig.cameras], lidars=rig.all_lidars, complete=complete, sync_tolerance_s=tolerance_s
     )
-    stamps_ns = stated_stamps(path, files) if rig.other_lidars else [None] * len(files)
+    stamps_ns = stated_stamps(path, len(found)) if rig.other_lidars else [None] * len(found)
     frames = tuple(
-        Frame(
-            start + n,
-            prefix + each.stem,
-            each.cloud,
-            each.images,
+        replace(
+            each,
+            index=start + n,
+            name=prefix + each.name,
             recorded_ns=stamps_ns[n],
             columns=rig.cloud_columns,
-            lidar_paths=each.lidars,
         )
-        for n, each in enumerate(files)
-        if not pairing or rig.cameras.keys() <= each.images.keys()
+        for n, each in enumerate(found)
+        if not pairing or rig.cameras.keys() <= each.image_paths.keys()
     )
     frames = frames if interval_s is None else _driven(frames, interval_s)
     return FoundFrames(frames, frames, (pairing,) if pairing else ())

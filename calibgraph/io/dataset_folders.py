@@ -23,16 +23,11 @@ from calibgraph.io.bags.stamps import (
 )
 from calibgraph.io.bags.storage import NEAR_S
 from calibgraph.io.clouds import CLOUD_SUFFIXES
-from calibgraph.io.frame_files import (
-    FrameFiles,
-    PublishedFolder,
-    files_by_stem,
-    frames_by_stem,
-    stamp_ns_in_name,
-    way_out,
-)
+from calibgraph.io.frame import Frame, frames_by_stem
+from calibgraph.io.frame_files import files_by_stem, stamp_ns_in_name, way_out
 from calibgraph.io.images import IMAGE_SUFFIXES
 from calibgraph.io.nuscenes import nuscenes
+from calibgraph.io.published import PublishedFolder
 
 LIDARS = "lidars"
 """Folder of the folders of several LiDARs, named as in the rig."""
@@ -54,7 +49,7 @@ def folder_layout(folder: Path, lidar: str = "") -> tuple[Path, dict[str, Path]]
 def frames_of_folder(
     folder: Path, cameras: Sequence[str], *, lidars: Sequence[str] = (), complete: bool = True,
     sync_tolerance_s: float = NEAR_S,
-) -> tuple[list[FrameFiles], str]:  # fmt: skip
+) -> tuple[list[Frame], str]:  # fmt: skip
     """The frames of a folder; where names are stamps, those with an image near enough.
 
     Args:
@@ -67,14 +62,14 @@ def frames_of_folder(
         sync_tolerance_s: largest difference of the stamps that name a cloud and its images.
 
     Returns:
-        The files of each frame, one per cloud, in the order of the numbers in their names; and how
+        The frames, one per cloud, in the order of the numbers in their names; and how
         images were paired with clouds by stamps, in a line, empty where both have the same names.
     """
     published = published_folder(folder)
     if published is not None:
         frames = published.frames(cameras)
         for name in cameras if complete else ():
-            stems = ({f.stem for f in frames}, {f.stem for f in frames if name in f.images})
+            stems = ({f.name for f in frames}, {f.name for f in frames if name in f.image_paths})
             _require_pairs(folder, name, *stems)
         return frames, ""
     of_clouds, of_images = folder_layout(folder, *lidars[:1])
@@ -93,10 +88,7 @@ def frames_of_folder(
             return _paired_by_stamps(folder, stamped, taken, sync_tolerance_s=sync_tolerance_s)
     for name in cameras if complete else ():
         _require_pairs(folder, name, set(clouds), set(images[name]))
-    frames = frames_by_stem(clouds, images)
-    for frame in frames:
-        frame.lidars.update({n: of[frame.stem] for n, of in others.items() if frame.stem in of})
-    return frames, ""
+    return frames_by_stem(clouds, images, others), ""
 
 
 def _of_same_number(clouds: Mapping[str, Path], images: Mapping[str, Path]) -> dict[str, Path]:
@@ -130,9 +122,9 @@ def _stamps(files: Mapping[str, Path]) -> TopicStamps | None:
 
 def _paired_by_stamps(
     folder: Path, clouds: TopicStamps, images: Mapping[str, TopicStamps], *, sync_tolerance_s: float
-) -> tuple[list[FrameFiles], str]:
+) -> tuple[list[Frame], str]:
     """Each cloud with the image of every camera that is nearest by its name, as in a bag."""
-    frames = [FrameFiles(path.stem, path, {}) for path in clouds.paths]
+    frames = [Frame(n, path.stem, path, {}) for n, path in enumerate(clouds.paths)]
     parts = []
     for name, found in images.items():
         rows = nearest(clouds, found, round(sync_tolerance_s * 1e9))
@@ -150,12 +142,12 @@ def _paired_by_stamps(
                 camera=name,
             )
         for cloud in paired:
-            frames[cloud].images[name] = found.paths[rows[cloud]]
+            frames[cloud].image_paths[name] = found.paths[rows[cloud]]
         apart_ns = after_ns(clouds, found, rows, paired)
         unused = len(found.paths) - len({*rows[paired]})
         unused_text = f" ({unused} images not used)" if unused else ""
         parts.append(describe_offsets(name, apart_ns) + unused_text)
-    complete = sum(len(frame.images) == len(images) for frame in frames)
+    complete = sum(len(frame.image_paths) == len(images) for frame in frames)
     pairing = (
         f"{folder}: files are paired by the stamps in their names: {complete} of {len(frames)} "
         f"clouds have all images within {sync_tolerance_s:g} s (sync_tolerance_s); "

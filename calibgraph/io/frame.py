@@ -160,11 +160,6 @@ class Frame:
         return None if self.find_motion is None else self.find_motion()
 
     @property
-    def is_corrected(self) -> bool:
-        """Whether its cloud is corrected for motion."""
-        return self.find_motion is not None
-
-    @property
     def twist_per_s(self) -> Array | None:
         """(6,) of the LiDAR: rotation [rad/s], translation [m/s]; None if it is unknown."""
         if self.twist is not None:
@@ -290,6 +285,22 @@ class Frame:
         if motion is not None:
             files[_MOTION] = {"twist_per_s": list(motion.twist_per_s), "to_s": motion.to_s}
         return files
+
+
+def frames_by_stem(
+    clouds: Mapping[str, Path],
+    images: Mapping[str, Mapping[str, Path]],
+    lidars: Mapping[str, Mapping[str, Path]] | None = None,
+) -> list[Frame]:
+    """A frame per cloud, with the images and the clouds of other LiDARs that have its stem."""
+
+    def having(stem: str, files: Mapping[str, Mapping[str, Path]]) -> dict[str, Path]:
+        return {name: of[stem] for name, of in files.items() if stem in of}
+
+    return [
+        Frame(n, stem, cloud, having(stem, images), lidar_paths=having(stem, lidars or {}))
+        for n, (stem, cloud) in enumerate(clouds.items())
+    ]
 
 
 class ScanSteps:

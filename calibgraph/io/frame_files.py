@@ -1,16 +1,13 @@
-"""What readers of data sets return: the files of frames, and the rig of the complete cameras."""
+"""Files of frames by the numbers, stems and stamps in their names."""
 
 import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from decimal import Decimal
 from pathlib import Path
 from shlex import quote
-from typing import NamedTuple
 
 from calibgraph.errors import FileError
-from calibgraph.files import checked_model, is_utf8, read_text, require_file
-from calibgraph.model.rig import Camera, Rig
+from calibgraph.files import is_utf8, read_text, require_file
 
 _PCD = ".pcd"  # NAME.pcd.bin is a cloud of nuScenes
 _UNPACK = {".gz": "gunzip", ".bz2": "bunzip2", ".xz": "unxz", ".lz4": "unlz4", ".zst": "unzstd",
@@ -35,16 +32,6 @@ _WAYS_OUT = {
     ".active": "was not closed: mend it with `rosbag reindex {0}` and name it {1}",
 }
 """Per suffix that is not read, the way out; {0} is the file, {1} its name without the suffix."""
-
-
-@dataclass(frozen=True)
-class FrameFiles:
-    """The files of one frame, which share their stem; the clouds of other LiDARs, if it has any."""
-
-    stem: str
-    cloud: Path
-    images: dict[str, Path]
-    lidars: dict[str, Path] = field(default_factory=dict)
 
 
 def way_out(path: Path) -> str | None:
@@ -82,17 +69,17 @@ def stamp_ns_in_name(name: str) -> int | None:
     return int(found[0]["s"]) * _NS_BY_DIGITS[10] + int(found[0]["part"].ljust(9, "0"))
 
 
-def stated_stamps(folder: Path, frames: Sequence[FrameFiles]) -> Sequence[int | None]:
-    """The stamps [ns] of frames in times.txt beside them, a line each; None without that file.
+def stated_stamps(folder: Path, count: int) -> Sequence[int | None]:
+    """The stamps [ns] of so many clouds in times.txt, a line each; None without that file.
 
     A line is a number of seconds, or a time as :func:`stamp_ns_in_name` reads it.
     """
     path = folder / "times.txt"
     if not path.is_file():
-        return [None] * len(frames)
+        return [None] * count
     lines = read_text(path).split()
-    if len(lines) != len(frames):
-        raise FileError(path, f"has {len(lines)} stamps for {len(frames)} clouds; write one a line")
+    if len(lines) != count:
+        raise FileError(path, f"has {len(lines)} stamps for {count} clouds; write one a line")
     return [_stated_ns(path, line) for line in lines]
 
 
@@ -127,47 +114,3 @@ def files_by_stem(folder: Path, suffixes: Sequence[str]) -> dict[str, Path]:
                 raise FileError(path, remedy)
         raise FileError(folder, f"holds no file of a known kind; write or convert to {kinds}")
     return files
-
-
-def frames_by_stem(
-    clouds: Mapping[str, Path], images: Mapping[str, Mapping[str, Path]]
-) -> list[FrameFiles]:
-    """A frame per cloud, with the images of each camera that have its stem."""
-    return [
-        FrameFiles(stem, cloud, {name: of[stem] for name, of in images.items() if stem in of})
-        for stem, cloud in clouds.items()
-    ]
-
-
-class IncompleteCamera(FileError):
-    """A camera without its lens, its pose or its images; what is there but wrong is no such."""
-
-
-class PublishedFolder(NamedTuple):
-    """A folder of a published data set, read as far as it is asked.
-
-    Attributes:
-        lidar: its name.
-        cameras: their names.
-        read: the lens and T_camera_lidar of one; IncompleteCamera if a part is missing.
-        frames: the clouds in order, with the images of the cameras that have one.
-    """
-
-    lidar: str
-    cameras: Callable[[], Sequence[str]]
-    read: Callable[[str], Camera]
-    frames: Callable[[Sequence[str]], list[FrameFiles]]
-
-    def read_rig(self, path: Path) -> tuple[Rig, tuple[str, ...]]:
-        """The rig of the cameras that have all parts, with notes; the path is for errors."""
-        cameras: dict[str, Camera] = {}
-        missing: dict[str, IncompleteCamera] = {}
-        for name in self.cameras():
-            try:
-                cameras[name] = self.read(name)
-            except IncompleteCamera as error:
-                missing[name] = error
-        if missing and not cameras:
-            raise next(iter(missing.values()))
-        notes = tuple(f"{error}: camera {name!r} is left out" for name, error in missing.items())
-        return checked_model(Rig, {"lidar": self.lidar, "cameras": cameras}, path), notes

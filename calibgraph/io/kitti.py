@@ -20,15 +20,11 @@ import numpy as np
 from calibgraph.arrays import Array
 from calibgraph.errors import FileError
 from calibgraph.files import checked_model, read_text, require_file
-from calibgraph.io.frame_files import (
-    FrameFiles,
-    IncompleteCamera,
-    PublishedFolder,
-    files_by_stem,
-    frames_by_stem,
-)
+from calibgraph.io.frame import Frame, frames_by_stem
+from calibgraph.io.frame_files import files_by_stem
 from calibgraph.io.images import IMAGE_SUFFIXES, image_size
 from calibgraph.io.lenses import intrinsics_of_matrix
+from calibgraph.io.published import IncompleteCamera, PublishedFolder
 from calibgraph.model.geometry import transform
 from calibgraph.model.rig import Camera
 
@@ -85,7 +81,7 @@ def _folder(
             raise FileError(folder, "has no image folder (image_0 .. image_3, image_00 ..)")
         return [*images]
 
-    def frames(names: Sequence[str]) -> list[FrameFiles]:
+    def frames(names: Sequence[str]) -> list[Frame]:
         of = {n: files_by_stem(images.get(n, folder / n), IMAGE_SUFFIXES) for n in names}
         return frames_by_stem(files_by_stem(clouds, (".bin",)), of)
 

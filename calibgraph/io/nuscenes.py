@@ -16,8 +16,9 @@ from pydantic import BaseModel
 from calibgraph.arrays import Array
 from calibgraph.errors import DatasetError, FileError
 from calibgraph.files import checked_model, read_text
-from calibgraph.io.frame_files import FrameFiles, IncompleteCamera, PublishedFolder
+from calibgraph.io.frame import Frame
 from calibgraph.io.lenses import intrinsics_of_matrix
+from calibgraph.io.published import IncompleteCamera, PublishedFolder
 from calibgraph.io.rig_parts import pose_of_quaternion
 from calibgraph.model.geometry import invert
 from calibgraph.model.rig import Camera, Finite
@@ -65,15 +66,16 @@ def nuscenes(path: Path) -> PublishedFolder | None:
         _require_one_rig(path, (LIDAR, *names), instants)
         return names
 
-    def frames(names: Sequence[str]) -> list[FrameFiles]:
+    def frames(names: Sequence[str]) -> list[Frame]:
         folder, _, instants = _read_tables(path)
         return [
-            FrameFiles(
+            Frame(
+                n,
                 str(taken[LIDAR].stamp_us),
                 folder.parent / taken[LIDAR].filename,
                 {n: folder.parent / taken[n].filename for n in names if n in taken},
             )
-            for taken in instants
+            for n, taken in enumerate(instants)
         ]
 
     return PublishedFolder(LIDAR, cameras, lambda name: _camera(path, name), frames)

@@ -19,7 +19,7 @@ from calibgraph.errors import DatasetError, RigError
 from calibgraph.files import checked_model
 from calibgraph.io.lenses import CameraLens
 from calibgraph.model.geometry import invert, transform
-from calibgraph.model.rig import ROUNDING, Mount, Rig
+from calibgraph.model.rig import ROUNDING, Mount, RelativePose, Rig
 
 _TURN_RAD = 2 * math.pi + ROUNDING
 
@@ -131,15 +131,12 @@ _RELATIVE_SIGMAS = math.radians(0.1), 0.005
 """Assumed of relative poses whose file has none: a stereo calibration with a board, generously."""
 
 
-@dataclass(frozen=True, eq=False)
-class RelativeCamera:
-    """A (4, 4) T_a_b between two cameras, in optical axes; its sigmas if the file has them."""
-
-    a: str
-    b: str
-    T_a_b: Array
-    rotation_sigma_rad: float | None = None
-    translation_sigma_m: float | None = None
+def relative_pose(a: str, b: str, T_a_b: Array) -> RelativePose:
+    """A pose between two cameras, in optical axes, of a file that has no sigmas of it."""
+    rotation, translation = _RELATIVE_SIGMAS
+    return RelativePose(
+        a=a, b=b, T_a_b=T_a_b, rotation_sigma_rad=rotation, translation_sigma_m=translation
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +158,7 @@ class RigParts:
     path: Path
     lenses: Mapping[str, CameraLens] = field(default_factory=dict)
     T_camera_lidar: Mapping[str, Array] = field(default_factory=dict)
-    relative_poses: tuple[RelativeCamera, ...] = ()
+    relative_poses: tuple[RelativePose, ...] = ()
     links: tuple[Link, ...] = ()
     frame_ids: Mapping[str, str] = field(default_factory=dict)
     mounts: Mapping[str, Mount] = field(default_factory=dict)
@@ -182,7 +179,7 @@ class RigParts:
             for part in by_camera
         }
         pairs = (
-            replace(pair, a=names.get(pair.a, pair.a), b=names.get(pair.b, pair.b))
+            pair.model_copy(update={"a": names.get(pair.a, pair.a), "b": names.get(pair.b, pair.b)})
             for pair in self.relative_poses
         )
         return replace(self, **named, relative_poses=tuple(pairs))
@@ -220,16 +217,7 @@ class RigParts:
                 }
                 for name, lens in self.lenses.items()
             },
-            "relative_poses": [
-                {
-                    "a": pair.a,
-                    "b": pair.b,
-                    "T_a_b": pair.T_a_b,
-                    "rotation_sigma_rad": pair.rotation_sigma_rad or _RELATIVE_SIGMAS[0],
-                    "translation_sigma_m": pair.translation_sigma_m or _RELATIVE_SIGMAS[1],
-                }
-                for pair in self.relative_poses
-            ],
+            "relative_poses": self.relative_poses,
         }
         return checked_model(Rig, content, self.path)
 

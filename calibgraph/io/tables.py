@@ -19,7 +19,6 @@ from calibgraph.model.camera_matches import COLUMNS, FORMAT, NAMES, NUMBERS, PLA
 from calibgraph.model.correspondences import (
     COORDINATES,
     INFORMATION,
-    OPTIONAL_WHOLE,
     TWIST,
     Correspondences,
     as_confidence,
@@ -44,7 +43,8 @@ def load_correspondences(path: Path | str) -> Correspondences:
     """
     path = require_file(Path(path))
     table = read_arrow(path)
-    require_rows(path, len(table))
+    if not len(table):
+        raise FileError(path, "holds no rows; write the correspondences into it")
     try:
         return from_arrow(table)
     except CorrespondenceError as error:
@@ -119,12 +119,6 @@ def arrow_reads(path: Path) -> Iterator[None]:
         raise FileError(path, message) from error
 
 
-def require_rows(path: Path, rows: int) -> None:
-    """Check that a file has rows."""
-    if not rows:
-        raise FileError(path, "holds no rows; write the correspondences into it")
-
-
 def from_arrow(table: pa.Table) -> Correspondences:
     """Build correspondences from an Arrow table that has the file format's columns."""
     import pyarrow as pa
@@ -187,7 +181,7 @@ def _from_plain_columns(table: pa.Table) -> Correspondences:
         else np.ones(len(table), np.float32),
         information_px=stack(INFORMATION) if INFORMATION[0] in given else None,
         twist_per_s=stack(TWIST) if TWIST[0] in given else None,
-        **{name: _whole(table, name) for name in OPTIONAL_WHOLE if name in given},
+        stamp_ns=_whole(table, "stamp_ns") if "stamp_ns" in given else None,
         metadata=json.loads((table.schema.metadata or {}).get(b"matcher", b"{}")),
     )
 

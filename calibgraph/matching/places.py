@@ -8,8 +8,8 @@ direction, is recognised by the cloud of the place's first frame. Clouds are com
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from functools import cache, partial
+from collections.abc import Sequence
+from functools import partial
 from itertools import pairwise
 
 import gtsam
@@ -41,14 +41,8 @@ MOST_S = 1.0
 """Longest time over which twists are integrated: from the mean of those at both ends the distance
 differs by up to a t^2 / 4, which is 0.75 m at 3 m/s^2."""
 
-FOLLOWS_S, FOLLOWS_NUMBERS = 5.0, 10
-"""Time, or steps of their numbers if they have no stamps, within which a frame may be the next of a
-drive: only there can an unknown motion be a short one."""
-
 Motion = NDArray[np.float64] | None
 """(4, 4) T_later_earlier of the LiDAR; None where the two frames have too little in common."""
-FeaturesOf = Callable[[str], Features | None]
-"""Of a camera's image of one frame."""
 
 UNKNOWN_UP = (
     "which way is up in the clouds is unknown, so that they are not compared: all frames are taken "
@@ -76,7 +70,7 @@ def find_places(dataset: Dataset, rig: Rig, camera: str, *, seed: int = 0) -> li
     """
     places: dict[int, list[int]] = {}
     steps = [None, *motions(dataset, camera, rig.cameras[camera], seed=seed)]
-    walk = PlaceWalk(rig=rig)
+    walk = PlaceWalk(rig)
     for frame, step in zip(dataset.frames, steps, strict=True):
         places.setdefault(walk.first_of_place(frame, step), []).append(frame.index)
     return list(places.values())
@@ -86,19 +80,14 @@ class PlaceWalk:
     """The place of one frame after the other.
 
     Args:
-        most_places: that are remembered, those visited last; None: all.
-        in_sequence: whether the frames are of a drive: then a frame that follows the one before
-            closely stays at its place after an unknown motion, however unlike the clouds are.
         rig: whose cameras show which way is up in the clouds; None where z is.
     """
 
-    def __init__(
-        self, most_places: int | None = None, *, in_sequence: bool = False, rig: Rig | None = None
-    ) -> None:
+    def __init__(self, rig: Rig | None = None) -> None:
         self._T_now_first, self._first = np.eye(4), -1
         self._before: Frame | None = None
-        self._known: dict[int, UprightCloud] = {}  # by their first frames, the last visited last
-        self._most, self._in_sequence, self._rig = most_places, in_sequence, rig
+        self._known: dict[int, UprightCloud] = {}  # by their first frames
+        self._rig = rig
         self._R_up_lidar: Array | None = Z_UP  # once the rig is None
 
     def first_of_place(self, frame: Frame, step: Motion) -> int:
@@ -112,20 +101,15 @@ class PlaceWalk:
             found = earlier and later and self._align(later, [earlier])
             step = found[1] if found else None
             if step is None:  # unless enough stands upright in both, nothing shows another place
-                follows = self._in_sequence and _follows(before, frame)
                 unlike = all(
                     each and len(each.points_m) >= LEAST_UPRIGHT for each in (earlier, later)
                 )
-                self._find_place(frame, may_stay=follows or not unlike)
+                self._find_place(frame, may_stay=not unlike)
                 return self._first
         self._T_now_first = step @ self._T_now_first
         if _distance_m(self._T_now_first) > PLACE_M:
             self._find_place(frame, left=self._first)
         return self._first
-
-    def remember(self, frame: Frame) -> None:
-        """Register a place by its first frame."""
-        self._visit(frame.index, self._upright_cloud(frame))
 
     def _find_place(self, frame: Frame, *, left: int | None = None, may_stay: bool = False) -> None:
         """The most similar known place but for one that was left, else the present or a new one."""
@@ -143,8 +127,6 @@ class PlaceWalk:
         self._known.pop(first, None)
         if cloud is not None:
             self._known[first] = cloud
-        while self._most is not None and len(self._known) > self._most:
-            del self._known[next(iter(self._known))]
 
     def _align(self, now: UprightCloud, known: Sequence[UprightCloud]) -> tuple[int, Array] | None:
         """As of :func:`align_with_any`, in the axes of the LiDAR."""
@@ -192,63 +174,8 @@ def _given_motion(before: Frame, now: Frame) -> Motion:
     return np.asarray(gtsam.Pose3.Expmap(-seconds * (twists[0] + twists[1]) / 2).matrix())
 
 
-def _follows(before: Frame, now: Frame) -> bool:
-    """Whether a frame may be the next of a drive, by stamps or numbers; names tell nothing else."""
-    seconds = seconds_between(before, now)
-    if seconds is not None:
-        return abs(seconds) <= FOLLOWS_S
-    numbers = [frame.name.rpartition("/")[2] for frame in (before, now)]
-    if not all(number.isdecimal() for number in numbers):
-        return True
-    return abs(int(numbers[1]) - int(numbers[0])) <= FOLLOWS_NUMBERS
-
-
 def _distance_m(T: Array) -> float:
     return float(np.linalg.norm(T[:3, 3]))
-
-
-class PlaceFinder:
-    """The place of one frame after the other, from their images and clouds.
-
-    While the motion is not found by the first camera of the rig, the next ones are tried.
-
-    Args:
-        rig: cameras at their extrinsics.
-        most_places: that are remembered, those visited last; None: all.
-        seed: of the robust fits.
-    """
-
-    def __init__(self, rig: Rig, *, most_places: int | None = None, seed: int = 0) -> None:
-        self._rig, self._seed = rig, seed
-        self._walk = PlaceWalk(most_places, in_sequence=True, rig=rig)
-        self._before: tuple[Frame, FeaturesOf] | None = None
-
-    def remember(self, frame: Frame) -> None:
-        """Register a place by its first frame, without moving to it."""
-        self._walk.remember(frame)
-
-    def first_of_place(self, frame: Frame) -> int:
-        """The number of the first frame of this frame's place; see `find_places`.
-
-        A frame whose image or cloud cannot be read is of the place of the one before.
-        """
-        features = cache(lambda name: _detect(frame, name, self._rig.cameras[name]))
-        before, self._before = self._before, (frame, features)
-        step = None if before is None else _given_motion(before[0], frame)
-        if before is not None and step is None:
-            step = self._step(before, self._before)
-        return self._walk.first_of_place(frame, step)
-
-    def _step(self, before: tuple[Frame, FeaturesOf], now: tuple[Frame, FeaturesOf]) -> Motion:
-        for name, lens in self._rig.cameras.items():
-            try:
-                both = (before[0], before[1](name)), (now[0], now[1](name))
-                step = _motion(both, lens=lens, seed=self._seed)
-            except (CalibrationError, OSError):  # the matcher reports it
-                continue
-            if step is not None:
-                return step
-        return None
 
 
 def motions(dataset: Dataset, camera: str, lens: Camera, *, seed: int = 0) -> list[Motion]:

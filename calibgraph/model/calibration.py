@@ -127,7 +127,6 @@ class Calibration:
         config: the resolved settings.
         stage1_T_camera_lidar: the pairwise estimates.
         weaknesses: per camera, the least determined directions, in words, the worst first.
-        prior_share: per camera, the share of its result that comes from priors, not data (0-1).
         error_sources: per camera with an error bar, the shares of its sources.
         lens: per camera whose lens was estimated, its parameters; the lens itself is the rig's.
         lens_covariance: per camera of ``lens``, (6 + k, 6 + k) of xi and of its parameters in their
@@ -160,7 +159,6 @@ class Calibration:
     pair_covariance: Mapping[str, Array] = field(default_factory=dict)
     stage1_T_camera_lidar: dict[str, Array] = field(default_factory=dict)
     weaknesses: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    prior_share: dict[str, float] = field(default_factory=dict)
     error_sources: Mapping[str, ErrorSources] = field(default_factory=dict)
     lens: dict[str, tuple[LensEstimate, ...]] = field(default_factory=dict)
     lens_covariance: dict[str, Array] = field(default_factory=dict)
@@ -274,8 +272,11 @@ class Calibration:
     @property
     def not_included(self) -> str:
         """The errors that the bars leave out: relative poses show the clouds' scale."""
-        table = self.correspondences
-        moves = table is not None and table.twist_per_s is not None
+        table, cameras = self.correspondences, self.rig.cameras.values()
+        if table is None:  # of a tracker, which corrects for the motion what the rig states
+            moves = any(camera.time_offset_s or camera.readout_s for camera in cameras)
+        else:
+            moves = table.twist_per_s is not None
         return left_out(self.config, self.rig, has_new_lens=bool(self.lens), motion_known=moves)
 
     def error_bar_holds(self, name: str) -> bool:
@@ -295,10 +296,6 @@ class Calibration:
         """The joint covariance of a camera's pose and lens, with the names of its rows."""
         rows = joint_parameters(self.lens[name])
         return {"parameters": rows, "covariance": self.lens_covariance[name].tolist()}
-
-    def with_inputs(self, inputs: Mapping[str, str]) -> Calibration:
-        """The same result with the SHA-256 of its input files, by path."""
-        return replace(self, inputs=dict(inputs))
 
     def save(self, folder: Path | str) -> Path:
         """Write ``calibration.yaml``, and tables of the matches if there are any, into a folder.
@@ -354,7 +351,7 @@ class Calibration:
 
 _KEYS = (
     "format", "verdict", "summary", "camera_verdicts", "lidar_verdicts", "weaknesses",
-    "prior_share", "error_sources", "frames", "T_camera_lidar", "sigmas", "error_bar_holds", "rig",
+    "error_sources", "frames", "T_camera_lidar", "sigmas", "error_bar_holds", "rig",
     "covariance_of", "covariance", "joint_names", "joint_covariance", "pair_covariance_of",
     "pair_covariance",
     "lens", "lens_covariance", "residuals", "counts", "frames_used",

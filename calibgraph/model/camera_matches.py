@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import json
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -106,10 +106,6 @@ class CameraMatches:
         for name in _SHAPES:
             object.__setattr__(kept, name, getattr(self, name)[rows])
         return kept
-
-    def with_planes(self, planes_lidar_per_m: Array) -> CameraMatches:
-        """The same features with other planes, (n, 2, 3)."""
-        return replace(self, planes_lidar_per_m=planes_lidar_per_m)
 
     def save(self, path: Path | str) -> None:
         """Write the table as Parquet, or as CSV if the name ends in .csv, atomically."""

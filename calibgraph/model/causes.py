@@ -48,7 +48,6 @@ CAUSES: dict[str, Cause] = {
             "search": "Correct the guess, or calibrate with a wider search (--search-deg up to 45, "
             "--search-m up to 5); see with doctor whether images and clouds of this camera belong "
             "together.",
-            "range_rotation": _FROM_RESULT, "range_translation": _FROM_RESULT,
         },
     ),
     "search": Cause(
@@ -58,7 +57,7 @@ CAUSES: dict[str, Cause] = {
     ),
     "time": Cause(
         "Pair each image with the cloud of its own instant: correct the time stamps or the offset.",
-        {"own_clouds": "", "clouds of another time": "",
+        {"own_clouds": "",
          **dict.fromkeys(("time_offset", "lens_time_offset"), "Correct the time stamps, or "
                          "estimate the time of the images: --estimate offset."),
          "time_prior": "Check that the stamps of images and clouds, and the motion, are right. "
@@ -69,7 +68,6 @@ CAUSES: dict[str, Cause] = {
         "belong to these images.",
         {
             "lens": "",
-            "values of the rig": "Correct the named value in the rig.",
             **{f"{by}{name}": "Check that intrinsics and image size belong to these images, or "
                f"estimate the lens: --estimate {part}."
                for by in ("lens_", "") for name, part in _ESTIMATED_AS.items()},
@@ -95,8 +93,7 @@ CAUSES: dict[str, Cause] = {
     ),
     "priors": Cause(
         "Check relative_poses and priors in the rig: p_a = T_a_b * p_b, and their sigmas.",
-        {"relative_pose": "",
-         "prior_share": "Give this camera matches of its own, or check its priors: they decide."},
+        {"relative_pose": ""},
     ),
     "agreement": Cause(
         _STRUCTURE,
@@ -109,12 +106,12 @@ CAUSES: dict[str, Cause] = {
     "matches": Cause(
         "Look at the residuals of the matches in the report: too many are wrong.",
         {"competing_solution": "", "failed_frames": "",
-         "assumed_spread": "Leave loss_scale_px out of the config, or raise it.",
          "start_dependence": _LEARNED, "memorization": _LEARNED},
     ),
     "frames": Cause(
         _FRAMES,
         {"outlier_frames": "", "place_distance": "", "place_inliers": "",
+         "frames_best": "Look at the frames that are named, and leave them out if something moved.",
          "disagreeing_frames": "Check whether the camera was moved.",
          "drift": "Check whether the camera's mount is loose."},
     ),

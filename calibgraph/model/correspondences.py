@@ -32,10 +32,10 @@ TWIST_RULE = "be under 6 rad/s, then under 100 m/s (rotation first, in radians)"
 
 MIN_INFORMATION, MAX_INFORMATION = 1e-12, 1e8  # 1/px^2: errors from 1e6 px down to 1e-4 px
 
-OPTIONAL_WHOLE = ("stamp_ns", "point_index")
-_WHOLE = ("frame", *OPTIONAL_WHOLE)
+_WHOLE = ("frame", "stamp_ns")
 _REQUIRED = ("camera", "frame", *COORDINATES)
-_COLUMNS = (*_REQUIRED, "confidence", *OPTIONAL_WHOLE, *INFORMATION, *TWIST)
+_COLUMNS = (*_REQUIRED, "confidence", "stamp_ns", *INFORMATION, *TWIST)
+_FORMER = "point_index"  # a column of earlier tables, which is not read
 _TEXT = ("string", "large_string", "string_view", "binary", "large_binary")
 
 WITHOUT_METADATA = (
@@ -63,7 +63,6 @@ class Correspondences:
             [1/px^2], positive semidefinite; it may have rank one (an edge constrains only its
             normal). None stands for the identity.
         stamp_ns: (n,) or None: time of the frame.
-        point_index: (n,) or None: the point's row in its frame's cloud, -1 if it is none of them.
         twist_per_s: (n, 6) or None: of the LiDAR in its axes, rotation [rad/s], translation [m/s].
         metadata: as the file has it: the matcher, its settings, its findings and the places.
         findings: the matcher's, read from the metadata.
@@ -82,7 +81,6 @@ class Correspondences:
     confidence: NDArray[np.float32]
     information_px: Array | None = None
     stamp_ns: NDArray[np.int64] | None = None
-    point_index: NDArray[np.int64] | None = None
     twist_per_s: Array | None = None
     metadata: dict[str, Any] = field(default_factory=dict)
     findings: MatcherFindings = field(init=False)
@@ -122,7 +120,6 @@ class Correspondences:
         confidence: ArrayLike | None = None,
         information_px: ArrayLike | None = None,
         stamp_ns: ArrayLike | None = None,
-        point_index: ArrayLike | None = None,
         twist_per_s: ArrayLike | None = None,
         metadata: dict[str, Any] | None = None,
     ) -> Correspondences:
@@ -133,9 +130,8 @@ class Correspondences:
         """
         pixels = np.atleast_2d(np.asarray(pixels_px, dtype=np.float64))
         n = len(pixels)
-        whole = {"frame": frame, "stamp_ns": stamp_ns, "point_index": point_index}
-        for name, numbers in whole.items():
-            check_whole(name, numbers)
+        check_whole("frame", frame)
+        check_whole("stamp_ns", stamp_ns)
         one = isinstance(camera, str) and n > 0  # not sorted, as the names of many rows are
         of_rows = np.asarray([camera] if one else np.broadcast_to(np.asarray(camera), n))
         names, index = np.unique(of_rows, return_inverse=True)
@@ -148,7 +144,6 @@ class Correspondences:
             confidence=as_confidence(np.ones(n) if confidence is None else confidence),
             information_px=_optional(information_px, np.float64),
             stamp_ns=_optional(stamp_ns, np.int64),
-            point_index=_optional(point_index, np.int64),
             twist_per_s=_optional(twist_per_s, np.float64),
             metadata=metadata or {},
         )
@@ -236,8 +231,7 @@ class Correspondences:
             **dict(zip(COORDINATES[2:], self.points_lidar_m.T, strict=True)),
             "confidence": self.confidence,
         }
-        optional = {name: getattr(self, name) for name in OPTIONAL_WHOLE}
-        columns |= {name: column for name, column in optional.items() if column is not None}
+        columns |= {} if self.stamp_ns is None else {"stamp_ns": self.stamp_ns}
         for names, values in ((INFORMATION, self.information_px), (TWIST, self.twist_per_s)):
             columns |= {} if values is None else dict(zip(names, values.T, strict=True))
         metadata = {"format": TABLE_FORMAT, "matcher": json.dumps(self.metadata)}
@@ -252,8 +246,6 @@ class Correspondences:
             self._require(~beyond_vehicles(twist), "twist", twist, TWIST_RULE)
         c = self.confidence
         self._require((c > 0) & (c <= 1), "confidence", c, "lie in (0, 1]")
-        if self.point_index is not None:
-            self._require(self.point_index >= -1, "point_index", self.point_index, "be at least -1")
         if self.information_px is not None:
             i = self.information_px
             good = (np.abs(i) < MAX_INFORMATION).all(axis=1)
@@ -272,7 +264,7 @@ class Correspondences:
 
 _WIDTHS = {
     "camera_index": 1, "frame": 1, "pixels_px": 2, "points_lidar_m": 3, "confidence": 1,
-    "information_px": 3, "stamp_ns": 1, "point_index": 1, "twist_per_s": 6,
+    "information_px": 3, "stamp_ns": 1, "twist_per_s": 6,
 }  # fmt: skip
 _OTHERS = {"cameras", "metadata", "findings", "places"}
 assert set(_WIDTHS) == {f.name for f in fields(Correspondences)} - _OTHERS
@@ -300,7 +292,7 @@ def concatenate(tables: Sequence[Correspondences]) -> Correspondences:
         stated = [(table.information_px, len(table)) for table in tables]
         parts = [np.tile([1.0, 0.0, 1.0], (n, 1)) if i is None else i for i, n in stated]
         columns["information_px"] = np.concatenate(parts)
-    for name in ("stamp_ns", "point_index", "twist_per_s"):
+    for name in ("stamp_ns", "twist_per_s"):
         given = [getattr(table, name) for table in tables if len(table)]
         if given and all(column is not None for column in given):
             columns[name] = np.concatenate(given)
@@ -370,7 +362,7 @@ def check_schema(schema: pa.Schema) -> None:
         raise CorrespondenceError(f"a column's name is not UTF-8 ({error}); rename it") from error
     names = [name for name, _ in types]
     missing = [name for name in _REQUIRED if name not in names]
-    unknown = [name for name in names if name not in _COLUMNS]
+    unknown = [name for name in names if name not in (*_COLUMNS, _FORMER)]
     if missing:
         raise CorrespondenceError(f"column {missing[0]!r} is missing; found {names}")
     if unknown:

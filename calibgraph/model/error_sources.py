@@ -131,9 +131,6 @@ def left_out(config: Config, rig: Rig, *, has_new_lens: bool, motion_known: bool
     """
     free = has_new_lens and {*config.estimate} - {"offset", "readout"}
     lens = "other intrinsics" if free else "intrinsics"
-    if config.preset == "auto":  # lenses and clocks are uncertain
-        lens += " beyond what the rig states"
-    times = "offset" in config.estimate or (config.preset == "auto" and motion_known)
-    others = [] if times else ["time offset"]
+    others = [] if motion_known or "offset" in config.estimate else ["time offset"]
     others += [] if rig.relative_poses else ["range scale"]
-    return ", ".join([lens, *others])
+    return ", ".join([f"{lens} beyond what the rig states", *others])

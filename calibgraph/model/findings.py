@@ -20,7 +20,6 @@ _OF_ONE_SEARCH = ("found", "missed", "chance")
 _PER_CAMERA = (
     "z_score", *_OF_ONE_SEARCH, "contradicted", "start_dependence", "memorization", "failed_share"
 )  # fmt: skip
-_FORMER_KEYS = {"contrast": "z_score", "recall": "memorization"}
 IMAGES = "calibgraph_images"
 """Key of what the images said of a result; its content is of ``calibgraph.trust.image_record``."""
 STAGE1 = "stage1"
@@ -101,9 +100,7 @@ class MatcherFindings:
         """
         if not metadata:
             return _NOTHING
-        former = {_FORMER_KEYS[key]: metadata[key] for key in _FORMER_KEYS if key in metadata}
-        stated = {**former, **metadata}
-        values = {key: stated[key] for key in _KEYS & stated.keys()}
+        values = {key: metadata[key] for key in _KEYS & metadata.keys()}
         for key in values.keys() & {*_PER_CAMERA}:
             of = values[key] or {}
             values[key] = {str(name): of[name] for name in of} if isinstance(of, dict) else of

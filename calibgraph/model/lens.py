@@ -187,7 +187,7 @@ class LensSigmas(NamedTuple):
 
     def state_in(self, camera: Camera) -> Camera:
         """A camera with these sigmas, unless it states its own."""
-        if camera.intrinsics_sigma_px is not None or camera.model == "equirectangular":
+        if camera.intrinsics_sigma_px is not None:
             return camera
         focal_px = round(self.focal * camera.intrinsics_px.fx, 2)
         sigma = IntrinsicsSigma(focal=focal_px, centre=round(self.centre_px, 2))
@@ -209,11 +209,7 @@ def state_calibrated(rig: Rig) -> Rig:
 
 def describe_unstated(rig: Rig) -> str:
     """The cameras whose lens has no stated sigma, in a clause; empty without any."""
-    names = [
-        name
-        for name, camera in rig.cameras.items()
-        if camera.intrinsics_sigma_px is None and camera.model != "equirectangular"
-    ]
+    names = [name for name, camera in rig.cameras.items() if camera.intrinsics_sigma_px is None]
     if not names:
         return ""
     return (
@@ -252,4 +248,4 @@ def lens_difference(camera: Camera, other: Camera, pixels_px: Array) -> Array:
     rays, known = unproject(camera.lens, pixels_px)
     seen, valid = other.lens.project(rays)
     known &= valid
-    return np.asarray(np.where(known[:, None], other.lens.subtract(seen, pixels_px), np.nan))
+    return np.asarray(np.where(known[:, None], seen - pixels_px, np.nan))

@@ -21,10 +21,8 @@ Groups = tuple[tuple[int, ...], ...]
 
 PLACES = "places"
 STATIONARY = "stationary"
-_STATIONARY_BEFORE = "same_place"
-"""The key of older tables."""
 _MOST_DESCRIBED = 8
-KEYS = (PLACES, STATIONARY, _STATIONARY_BEFORE)
+KEYS = (PLACES, STATIONARY)
 
 
 @dataclass(frozen=True)
@@ -47,9 +45,8 @@ class Places:
         Raises:
             CorrespondenceError: if they are not lists of lists of frame numbers.
         """
-        key = STATIONARY if STATIONARY in metadata else _STATIONARY_BEFORE
         found = {}
-        for name in (name for name in (PLACES, key) if name in metadata):
+        for name in (name for name in KEYS if name in metadata):
             try:
                 found[name] = _READER.validate_python(metadata[name])
             except ValidationError as error:
@@ -57,7 +54,7 @@ class Places:
                     f"{name} of the table's metadata must be lists of frame numbers, as in "
                     f"[[0, 1, 2], [7, 8]], found {metadata[name]!r:.60}"
                 ) from error
-        return Places(found.get(key, ()), found.get(PLACES))
+        return Places(found.get(STATIONARY, ()), found.get(PLACES))
 
     def to_metadata(self) -> dict[str, Any]:
         """As keys of the metadata; unknown values have no key."""

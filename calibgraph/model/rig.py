@@ -27,7 +27,7 @@ from pydantic import (
 
 from calibgraph.arrays import Array
 from calibgraph.errors import RigError
-from calibgraph.files import StrictNumbers, write_yaml
+from calibgraph.files import StrictNumbers, holds_truth_value, write_yaml
 from calibgraph.model.correspondences import MAX_COORDINATE
 from factors import Lens, LensModel
 from factors.lens import ORDERS
@@ -79,23 +79,42 @@ _TO_LISTS = PlainSerializer(lambda array: array.tolist(), return_type=list)
 Transform = Annotated[Array, BeforeValidator(rigid_transform), _TO_LISTS]
 
 
-def _pose_covariance(value: Any) -> Array:
-    """Check a (6, 6) covariance of a pose: symmetric, positive definite."""
+LARGEST_VARIANCE = 1e24
+"""That of a pose that nothing determines is smaller."""
+_DIGITS = 1e-6  # of correlations: other programs may write fewer
+
+
+def covariance_matrix(value: Any) -> Array:
+    """Check a covariance: a square matrix of finite numbers, symmetric, no variance negative."""
     try:
-        covariance = np.array(value, dtype=np.float64)
+        found = np.array(value, np.float64)
     except (TypeError, ValueError, OverflowError) as error:
-        raise ValueError("expected a 6x6 matrix of numbers") from error
-    if covariance.shape != (6, 6) or not np.isfinite(covariance).all():
-        raise ValueError(f"expected a 6x6 matrix of finite numbers, found {covariance.shape}")
-    units = np.sqrt(np.abs(np.diag(covariance)))
-    if (np.diag(covariance) <= 0).any() or not np.allclose(
-        covariance / np.outer(units, units), covariance.T / np.outer(units, units)
-    ):
-        raise ValueError("the covariance is not symmetric with a positive diagonal")
-    if np.linalg.eigvalsh(covariance / np.outer(units, units))[0] <= 0:
+        raise ValueError("expected a matrix of numbers") from error
+    if holds_truth_value(value):
+        raise ValueError("expected a matrix of numbers, found a truth value in it")
+    is_finite = (np.abs(found) <= LARGEST_VARIANCE).all()
+    if found.ndim != 2 or len({*found.shape}) != 1 or not is_finite:  # noqa: PLR2004
+        raise ValueError(f"expected a square matrix of finite numbers, found {found.shape}")
+    variances = np.diag(found)
+    units = np.sqrt(np.where(variances > 0, variances, 1.0))
+    correlations = found / np.outer(units, units)
+    if not np.allclose(correlations, correlations.T, atol=_DIGITS):
+        raise ValueError("it is not symmetric; if the file was edited, write it again")
+    if (variances < 0).any() or np.linalg.eigvalsh(correlations)[0] < -_DIGITS * len(found):
+        raise ValueError("it has negative variances; if the file was edited, write it again")
+    return found
+
+
+def _pose_covariance(value: Any) -> Array:
+    """Check a (6, 6) covariance of a pose, all of which is known."""
+    found = covariance_matrix(value)
+    if found.shape != (6, 6):
+        raise ValueError(f"expected a 6x6 matrix, found {found.shape}")
+    units = np.sqrt(np.diag(found))
+    if not units.all() or np.linalg.eigvalsh(found / np.outer(units, units))[0] <= 0:
         raise ValueError("the covariance is not positive definite")
-    covariance.setflags(write=False)
-    return covariance
+    found.setflags(write=False)
+    return found
 
 
 PoseCovariance = Annotated[Array, BeforeValidator(_pose_covariance), _TO_LISTS]
@@ -115,7 +134,6 @@ LENS_NAMES: Final[Mapping[LensModel, tuple[str, ...]]] = {
     "omnidirectional": (
         "omnidirectional", "omni", "omnidir", "mei", "unified", "omni_radtan", "omni_none",
     ),
-    "equirectangular": ("equirectangular", "panorama", "spherical", "equirect", "panoramic"),
 }  # fmt: skip
 """Names of ROS, Kalibr, OpenCV, camodocal, COLMAP, Basalt, multical and others; the first is ours.
 Capitals, hyphens, blanks and a `Camera` or `model` at the end do not count."""

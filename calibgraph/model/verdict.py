@@ -22,9 +22,10 @@ COMMON_ERROR = "common_error"
 ABOUT_THE_DATA = frozenset({
     COMMON_ERROR, START, "copies", "correspondences", "correspondences_used",
     "failed_frames", "frames", "image evidence", "images", "lidar_instants", "lidar_loose",
-    "lidar_start", "no_error_bar", "prior_share", "repeated_frames", "sigma_rotation",
+    "lidar_start", "no_error_bar", "repeated_frames", "sigma_rotation",
     "sigma_translation", "terms", "went_on",
     "beyond_tolerance", "difference between even and odd frames", "focal_sensitivity",
+    "prior_share",
 })  # fmt: skip
 """Kinds of checks that count data: beyond a limit, nothing seems wrong yet. The last line is of
 results of earlier versions."""

@@ -28,7 +28,6 @@ def result_summary(result: Calibration, written: list[Path]) -> dict[str, Any]:
             **_sigmas(result, name),
             "residuals": _values(result.residuals.get(name)),
             "weaknesses": list(result.weaknesses.get(name, ())),
-            "prior_share": result.prior_share.get(name),
             "error_sources": _values(result.error_sources.get(name)),
             "counts": result.counts[name],
             "lens": [

@@ -15,7 +15,7 @@ from calibgraph.io.dataset import Dataset
 from calibgraph.io.formats import EXPORT_FORMATS
 from calibgraph.io.frame import frame_of_entry
 from calibgraph.model.calibration import FRAMES_SENTENCE, TANGENT_SENTENCE, Calibration
-from calibgraph.model.geometry import degrees_and_centimetres, invert, point_in_lidar
+from calibgraph.model.geometry import degrees_and_centimetres, invert
 from calibgraph.model.metrics import pose_error
 from calibgraph.model.places import describe_places
 from calibgraph.model.result_files import (
@@ -26,9 +26,7 @@ from calibgraph.model.result_files import (
     TABLES,
     require_own_tables,
 )
-from calibgraph.model.rig import Camera
 from calibgraph.model.verdict import Check, Direction, beside, in_unit, is_reachable
-from calibgraph.report import plots
 from calibgraph.report.kit import page_template
 from calibgraph.report.lidar_views import draw_lidars
 from calibgraph.report.page_overlays import (
@@ -37,8 +35,7 @@ from calibgraph.report.page_overlays import (
     width_on_page,
     write_overlays,
 )
-from calibgraph.report.plots import ReprojectionErrors, reprojection_errors
-from calibgraph.solver.pairs import match_errors_px
+from calibgraph.report.plots import reprojection_errors, residual_map
 
 
 def write_report(result: Calibration, path: Path | str) -> Path:
@@ -75,14 +72,13 @@ def render_page(result: Calibration) -> str:
             "moved": pose_error(camera.T_camera_lidar, guess.T_camera_lidar[name]),
             "sigmas": result.error_bar(name),
             "overlays": overlays.get(name),
-            "diagrams": camera_diagrams(result, name, errors.get(name)),
-            "worked": worked_point(camera, errors.get(name)),
+            "residuals": residual_map(camera, errors[name]) if name in errors else None,
             "rounds": [cameras[name] for cameras in result.rounds if name in cameras],
         }
         for index, (name, camera) in enumerate(rig.cameras.items())
     ]
     lidars = [_lidar_row(result, name) for name in result.lidar_verdicts]
-    views, views_left_out = draw_lidars(result) if lidars else ("", "")
+    views, views_left_out = draw_lidars(result) if lidars else (None, "")
     summary = result.summary
     return page_template("calibgraph.report").render(
         result=result,
@@ -132,12 +128,11 @@ def _camera_pairs(result: Calibration) -> list[dict[str, Any]]:
         return rows
     for a, b in table.pairs():
         matches = table.of_pair(a, b)
-        errors_px = match_errors_px(result.rig, matches)
-        known, name = errors_px[~np.isnan(errors_px)], f"relative pose of {a} and {b} by images"
+        known = np.isfinite(matches.planes_lidar_per_m[:, :, 0]).any(axis=1)
+        name = f"relative pose of {a} and {b} by images"
         rows.append({
-            "name": f"{a}, {b}", "matches": len(matches), "surfaces": len(known),
+            "name": f"{a}, {b}", "matches": len(matches), "surfaces": int(known.sum()),
             "frames": len(np.unique(matches.frame)),
-            "median_px": f"{np.median(known):.2f}" if len(known) else "-",
             "check": next((c for c in result.camera_verdicts[a].checks if c.name == name), None),
         })  # fmt: skip
     return rows
@@ -206,38 +201,6 @@ def check_cells(check: Check) -> tuple[str, str, str]:
     return found, warn, fail
 
 
-_DISTANCE_M = 10.0
-
-
-def worked_point(camera: Camera, errors: ReprojectionErrors | None) -> str:
-    """Project the used correspondence nearest to 10 m, or a point on the optical axis, in lines."""
-    T = camera.T_camera_lidar
-    used = None if errors is None else errors.select(errors.is_inlier)
-    if used is None or not len(used.frame):
-        point, matched = point_in_lidar(T, np.array([0.0, 0.0, _DISTANCE_M])), ""
-    else:
-        row = int(np.argmin(np.abs(used.distances_m - _DISTANCE_M)))
-        point, (u, v) = used.points_lidar_m[row], used.pixels_px[row]
-        matched = (
-            f"\nmatched pixel            = ({u:.2f}, {v:.2f}) px in frame {used.frame[row]}, "
-            f"residual {used.sizes_px[row]:.2f} px"
-        )
-    p_camera, k = T[:3, :3] @ point + T[:3, 3], camera.intrinsics_px
-    u, v = camera.lens.project(p_camera[None])[0][0]
-    distortion = ", ".join(f"{each:g}" for each in camera.distortion) or "none"
-    return (
-        f"p_lidar                  = {_vector(point)} m\n"
-        f"p_camera = R p_lidar + t = {_vector(p_camera)} m\n"
-        f"lens                     = {camera.model}, fx {k.fx:.3f}, fy {k.fy:.3f}, "
-        f"cx {k.cx:.3f}, cy {k.cy:.3f}; distortion {distortion}\n"
-        f"projected pixel (u, v)   = ({u:.2f}, {v:.2f}) px{matched}"
-    )
-
-
-def _vector(values: Array) -> str:
-    return f"({', '.join(f'{value:.3f}' for value in values)})"
-
-
 def matrix_text(T: Array) -> str:
     """The rows of a matrix, a line each."""
     return "\n".join(" ".join(f"{value: .6f}" for value in row) for row in T)
@@ -250,15 +213,6 @@ def pose_text(T: Array) -> str:
         f"translation x y z   = {' '.join(f'{v:.6f}' for v in T[:3, 3])} m\n"
         f"quaternion  x y z w = {x:.6f} {y:.6f} {z:.6f} {w:.6f}"
     )
-
-
-def camera_diagrams(
-    result: Calibration, name: str, errors: ReprojectionErrors | None
-) -> dict[str, str]:
-    """Residuals over the image, and its coverage, as data URIs by name."""
-    camera = result.rig.cameras[name]
-    drawn = {"over_image": plots.residual_map, "coverage": plots.coverage}
-    return {} if errors is None else {key: draw(camera, errors) for key, draw in drawn.items()}
 
 
 def recording_name(result: Calibration) -> str:

@@ -1,17 +1,18 @@
-"""The diagrams of one camera, each a PNG in a data URI. None contains text of the user's."""
+"""The residuals of one camera, as numbers and as a picture without text."""
 
 from __future__ import annotations
 
+import base64
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.geometry import to_T_lidar_camera
-from calibgraph.report.figure import image_figure, to_data_uri
 from calibgraph.solver.matches import CameraBlock, camera_blocks
 from calibgraph.solver.preprocess import preprocess
 
@@ -19,50 +20,46 @@ if TYPE_CHECKING:
     from calibgraph.model.rig import Camera
 
 
-# Colours that the colour-blind can tell apart (Okabe and Ito, "Color universal design").
-_INLIER, _OUTLIER = "#0072B2", "#D55E00"
+# BGR colours that the colour-blind can tell apart (Okabe and Ito, "Color universal design").
+_MATCH, _ARROW, _FRAME = (178, 114, 0), (0, 94, 213), (160, 160, 160)
 
 _MAX_DOTS = 6000
+_DOT_SHARE = 0.35  # of the colour of a dot, the rest is white; several dots add up
+_WIDTH_PX = 800
+_SUBPIXEL_BITS = 4
 ARROW_COLUMNS = 12  # cells across the image
-_COVERAGE_COLUMNS = 20
 _ROUND_FACTORS = np.array([1.0, 2.0, 5.0, 10.0])
 
 
-def residual_map(camera: Camera, errors: ReprojectionErrors) -> str:
-    """The used matches in the image, and the mean residual of each cell as an arrow."""
-    figure, axes = image_figure(camera)
-    inliers = errors.select(errors.is_inlier)
-    axes.plot(*_thin(inliers.pixels_px).T, ".", color=_INLIER, markersize=2, alpha=0.35)
+def residual_map(camera: Camera, errors: ReprojectionErrors) -> tuple[str, float | None]:
+    """The used matches in the image as dots, and the mean residual of each cell as an arrow.
+
+    Returns:
+        A PNG in a data URI; how many times as long as the residuals its arrows are, None if no cell
+        has enough matches.
+    """
+    inliers, scale = errors.select(errors.is_inlier), _WIDTH_PX / camera.width_px
+    height = max(1, round(scale * camera.height_px))
+    dots = _thin(inliers.pixels_px)
+    column, row = np.clip(scale * (dots + 0.5), 0, np.array([_WIDTH_PX, height]) - 1).astype(int).T
+    count = np.zeros((height, _WIDTH_PX), np.float32)
+    np.add.at(count, (row, column), 1)
+    clear = (1 - _DOT_SHARE) ** cv2.filter2D(count, -1, np.ones((3, 3), np.float32))[..., None]
+    image = np.rint(255 * clear + np.array(_MATCH) * (1 - clear)).astype(np.uint8)
     centres, means, cell_px = mean_residuals(camera, inliers, ARROW_COLUMNS)
-    factor = arrow_factor(means, cell_px)
-    axes.quiver(
-        *centres.T, *(factor * means).T, angles="xy", scale_units="xy", scale=1.0, color=_OUTLIER,
-        width=0.005, headwidth=3.5, headlength=3.5, headaxislength=3, minshaft=2, zorder=3,
-    )  # fmt: skip
-    title = f"mean residual per cell, drawn {factor:g} times as long"
-    axes.set_title(title if len(means) else "too few matches per cell for arrows", fontsize=9)
-    return to_data_uri(figure)
+    factor = arrow_factor(means, cell_px) if len(means) else None
+    starts = scale * (centres + 0.5) - 0.5
+    ends = starts + scale * (factor or 0) * means
+    for start, end in np.rint(2**_SUBPIXEL_BITS * np.stack([starts, ends], axis=1)).astype(int):
+        cv2.arrowedLine(image, start, end, _ARROW, 2, cv2.LINE_AA, _SUBPIXEL_BITS, 0.3)
+    cv2.rectangle(image, (0, 0), (_WIDTH_PX - 1, height - 1), _FRAME)
+    return png_uri(image), factor
 
 
-def coverage(camera: Camera, errors: ReprojectionErrors) -> str:
-    """Number of used matches in each cell of the image."""
-    from matplotlib.ticker import MaxNLocator
-
-    figure, axes = image_figure(camera, right_in=0.5)
-    pixels = errors.select(errors.is_inlier).pixels_px
-    extent = ((-0.5, camera.width_px - 0.5), (-0.5, camera.height_px - 0.5))
-    counts = sum_per_cell(pixels, camera, _COVERAGE_COLUMNS)
-    shown = np.where(counts > 0, counts, np.nan)
-    image = axes.imshow(
-        shown, extent=(*extent[0], *extent[1][::-1]), cmap="YlGnBu", vmin=0,
-        aspect="equal", interpolation="nearest",
-    )  # fmt: skip
-    empty = np.mean(counts == 0)
-    axes.set_title(f"used matches per cell; {empty:.0%} of the cells have none", fontsize=9)
-    beside = axes.inset_axes((1.015, 0.0, 0.025, 1.0))
-    whole = MaxNLocator(4, integer=True)
-    figure.colorbar(image, cax=beside, ticks=whole).ax.tick_params(labelsize=8)
-    return to_data_uri(figure)
+def png_uri(image: NDArray[np.uint8]) -> str:
+    """A picture, BGR, as a PNG in a data URI."""
+    _, data = cv2.imencode(".png", image)
+    return f"data:image/png;base64,{base64.b64encode(data.tobytes()).decode('ascii')}"
 
 
 def _thin(dots: Array) -> Array:
@@ -73,7 +70,7 @@ def _thin(dots: Array) -> Array:
 
 def arrow_factor(means: Array, cell_px: float) -> float:
     """A round factor by which the longer arrows fill their cells."""
-    longest = float(np.quantile(np.hypot(*means.T), 0.9)) if len(means) else 0.0
+    longest = float(np.quantile(np.hypot(*means.T), 0.9))
     wanted = max(1.0, 0.9 * cell_px / max(longest, 1e-6))
     power = 10.0 ** np.floor(np.log10(wanted))
     return float(power * _ROUND_FACTORS[wanted / power >= _ROUND_FACTORS].max())
@@ -117,20 +114,14 @@ class ReprojectionErrors:
     """The errors of one camera's preprocessed correspondences.
 
     Attributes:
-        points_lidar_m: (n, 3) in the LiDAR frame.
         pixels_px: (n, 2) matched pixels.
         vectors_px: (n, 2) projected less matched, along the directions that the match constrains:
             for an edge, across it. The gate compares its length.
-        distances_m: (n,) from the camera to the points.
-        frame: (n,) frame numbers.
         gate_px: tau of the result.
     """
 
-    points_lidar_m: Array
     pixels_px: Array
     vectors_px: Array
-    distances_m: Array
-    frame: NDArray[np.int64]
     gate_px: float
 
     @property
@@ -145,12 +136,7 @@ class ReprojectionErrors:
 
     def select(self, rows: NDArray[np.bool_]) -> ReprojectionErrors:
         """The errors of some correspondences."""
-        columns: dict[str, Any] = {
-            name: column[rows]
-            for name, column in vars(self).items()
-            if isinstance(column, np.ndarray)
-        }
-        return replace(self, **columns)
+        return replace(self, pixels_px=self.pixels_px[rows], vectors_px=self.vectors_px[rows])
 
 
 def reprojection_errors(result: Calibration) -> dict[str, ReprojectionErrors]:
@@ -176,13 +162,9 @@ def _errors_at(T_camera_lidar: Array, matches: CameraBlock, gate_px: float) -> R
     """The errors of those matches that project into the camera at this extrinsic."""
     block = matches.block
     residuals, valid = block.residuals(to_T_lidar_camera(T_camera_lidar))
-    points_camera = block.points_lidar_m @ T_camera_lidar[:3, :3].T + T_camera_lidar[:3, 3]
     everything = ReprojectionErrors(
-        points_lidar_m=block.points_lidar_m,
         pixels_px=block.pixels_px,
         vectors_px=constrained(residuals, matches.information),
-        distances_m=np.linalg.norm(points_camera, axis=1),
-        frame=matches.frame,
         gate_px=gate_px,
     )
     return everything.select(valid)

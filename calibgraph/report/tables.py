@@ -144,10 +144,9 @@ def result_table(result: Calibration) -> Table:
             "-" if residuals is None else f"{residuals.inlier_share:.0%}",
             str(result.counts[name]["used"]),
             str(result.counts[name]["frames_used"]),
-            "-" if name not in result.prior_share else f"{result.prior_share[name]:.0%}",
         ])  # fmt: skip
     numbers = ("off", "moved\ndeg", "moved\ncm", "median\npx", "inliers", "matches", "frames")
-    return make_table("Calibration", rows, words=("verdict",), numbers=(*numbers, "prior"))
+    return make_table("Calibration", rows, words=("verdict",), numbers=numbers)
 
 
 def lidar_table(result: Calibration) -> Table:

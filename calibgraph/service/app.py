@@ -36,6 +36,7 @@ def create_app(settings: Settings) -> FastAPI:
     app = FastAPI(
         title="calibgraph",
         description="Joint extrinsic calibration of cameras and a LiDAR.",
+        docs_url=None,  # a page that needs a network
         redoc_url=None,
         lifespan=_lifespan,
     )
@@ -67,7 +68,7 @@ def require_safe(host: str, *, has_tokens: bool) -> None:
     if not has_tokens and not is_loopback:
         raise CalibrationError(
             f"--host {host}: others could call; give --tokens FILE, or listen on 127.0.0.1; a "
-            "token is added to the file by calibgraph serve --tokens FILE --new-token submit"
+            "token is added to the file by calibgraph serve --tokens FILE --new-token"
         )
 
 

@@ -2,10 +2,10 @@
 
 import json
 import os
-import re
 import shutil
 import time
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from calibgraph.child_process import (
     memory_limit,
     output_to,
 )
-from calibgraph.errors import CalibrationError, FileError
+from calibgraph.errors import CalibrationError, FileError, in_words
 from calibgraph.files import sha256, write_text
 from calibgraph.io.dataset import load_dataset
 from calibgraph.io.rigs import load_rig
@@ -103,7 +103,7 @@ def _solve(task: JobTask, progress: Progress) -> Outcome:
     assert rig is not None and table is not None  # of each job
     progress("solving", 0, 1)
     result = solve(load_rig(rig), table, settings.config, settings.terms)
-    result = result.with_inputs({str(table): sha256(table)})
+    result = replace(result, inputs={str(table): sha256(table)})
     return _write(task, result, None, with_report=settings.report)
 
 
@@ -112,11 +112,11 @@ def _calibrate(task: JobTask, progress: Progress) -> Outcome:
     rig = _input(task, RIG)
     guess = None if rig is None else load_rig(rig)
     data = load_dataset(_recordings(task), guess, frames=settings.frames)
-    most = {"search_deg": settings.search_deg, "search_m": settings.search_m}
     matcher = structure_matcher(
         seed=settings.config.seed,
         all_frames=settings.frames is not None,
-        **(most if settings.search else dict.fromkeys(most, 0.0)),
+        search_deg=settings.search_deg,
+        search_m=settings.search_m,
     )
     most_s = task.settings.job_timeout_s / 2  # the rest is for the checks and the report
     result = calibrate(
@@ -187,24 +187,8 @@ def _answer(task: JobTask, note: Note) -> Outcome:
 
 
 MOST_FILES = 100_000
-MOST_RATIO = 100
-"""Clouds and images of sensors pack to a third at best; zeros to a thousandth."""
-_ANY_RATIO_BYTES = 10**8
-_NAME = r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}"
-_LAYOUT = re.compile(
-    rf"(?:rig\.yaml|calib\.txt|times\.txt|metadata\.yaml|{_NAME}\.(?:db3|mcap)"
-    rf"|(?:lidar|velodyne|image_[0-9])/{_NAME}|cameras/{_NAME}/{_NAME})"
-)
-"""What an archive may hold: a dataset folder, a KITTI odometry sequence, or a ROS 2 bag."""
-
-_DATA = re.compile(r"(?:lidar|velodyne|image_[0-9]|cameras)/")
-"""Folders in which nothing is left out."""
-
-_JUNK = re.compile(
-    r"(?:.*/)?(?:__MACOSX/.*|\.DS_Store|\._[^/]*|Thumbs\.db|desktop\.ini)", re.IGNORECASE
-)
-"""What file managers add."""
-
+_MOST_LETTERS = 250  # of a name; file systems hold 255 bytes
+_OF_FILE_MANAGERS = ("__MACOSX", "Thumbs.db", "desktop.ini")
 _BAGS = {b"#ROSBAG V2.0": ".bag", b"\x89MCAP0\r\n": ".mcap", b"SQLite format 3\0": ".db3"}
 _ZIP = b"PK\x03\x04"
 
@@ -218,7 +202,7 @@ def open_upload(upload: Path, target: Path, most_bytes: int) -> Path:
         most_bytes: of all unpacked files.
 
     Raises:
-        FileError: if it is neither, or an archive holds something else, or too much.
+        FileError: if it is neither, or an archive is damaged or holds too much.
     """
     with upload.open("rb") as file:
         head = file.read(16)
@@ -231,9 +215,10 @@ def open_upload(upload: Path, target: Path, most_bytes: int) -> Path:
         raise FileError(target, "is no .zip of a dataset folder, and no bag (.bag, .mcap, .db3)")
     try:
         _unpack(upload, target, most_bytes)
-    except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError, ValueError) as error:
-        raise FileError(target, f"cannot be unpacked ({error}); make the .zip again") from error
-    return target
+    except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError, ValueError,
+            FileExistsError, NotADirectoryError, IsADirectoryError) as error:  # fmt: skip
+        raise FileError(target, f"cannot be unpacked ({in_words(error)}); make it again") from error
+    return _dataset_in(target)
 
 
 def table_suffix(path: Path) -> str:
@@ -243,62 +228,36 @@ def table_suffix(path: Path) -> str:
 
 
 def _unpack(packed: Path, folder: Path, most_bytes: int) -> None:
-    """Unpack an archive, if all its names and sizes are as they should be."""
+    """Unpack an archive into a folder, if its names and sizes are as they should be.
+
+    Zipfile itself writes to no place outside of the folder, makes no links, and reads no more of a
+    file than its stated size.
+    """
     with zipfile.ZipFile(packed) as archive:
-        files = [m for m in archive.infolist() if not m.is_dir()]
+        files = [each for each in archive.infolist() if not _is_hidden(each.filename)]
+        size = sum(each.file_size for each in files)
         if len(files) > MOST_FILES:
             raise FileError(folder.name, f"{len(files)} files, expected up to {MOST_FILES}")
-        files = [m for m in files if not _JUNK.fullmatch(m.filename)]
-        targets = _targets([m.filename for m in files], folder.name)
-        size = sum(m.file_size for m in files)  # zipfile reads no more than that
-        packed_size = packed.stat().st_size
-        most = min(most_bytes, max(_ANY_RATIO_BYTES, MOST_RATIO * packed_size))
-        if size > most:
-            why = f"{packed_size} bytes stand for {size} when unpacked, expected up to {most}"
-            raise FileError(folder.name, f"{why}; send a recording of a sensor, or less of it")
+        if size > most_bytes:
+            why = f"{size} bytes when unpacked, expected up to {most_bytes}; send less of it"
+            raise FileError(folder.name, why)
+        if any(len(each.filename) > _MOST_LETTERS for each in files):
+            raise FileError(folder.name, f"has names of over {_MOST_LETTERS} letters; rename them")
         folder.mkdir()
-        for name, target in targets.items():
-            path = folder / target
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with archive.open(name) as source, path.open("xb") as file:
-                shutil.copyfileobj(source, file, 2**20)
+        archive.extractall(folder, files)
 
 
-def _targets(names: list[str], where: str) -> dict[str, str]:
-    """Where files of an archive belong in the dataset's folder, which may be in other folders."""
-    for name in names:
-        if not name.isprintable() or "\\" in name or {"", ".", ".."} & {*name.split("/")}:
-            raise _unexpected(name, where)
-    top = _top_folder(names)
-    targets = {name: name.removeprefix(top) for name in names}
-    left_out = [target for target in targets.values() if not _LAYOUT.fullmatch(target)]
-    for target in left_out:
-        if _DATA.match(target) or len(left_out) == len(targets):
-            raise _unexpected(target, where)
-    if left_out:
-        named = ", ".join(ascii(target[:100]) for target in left_out[:20])
-        print(f"{where}: {len(left_out)} files are no part of a dataset, and left out: {named}")
-    kept = {name: target for name, target in targets.items() if _LAYOUT.fullmatch(target)}
-    if len({name.lower() for name in names}) < len(names):
-        raise FileError(where, "holds a name twice")
-    return kept
+def _is_hidden(name: str) -> bool:
+    """Whether a file is one that file managers add."""
+    parts = [part for part in name.split("/") if part]
+    return any(part.startswith(".") or part in _OF_FILE_MANAGERS for part in parts)
 
 
-def _top_folder(names: list[str]) -> str:
-    """The folder in an archive that holds the dataset: the one in which most names fit."""
-    shared = os.path.commonpath([f"/{name}" for name in names]) if names else "/"
-    parts = [f"{part}/" for part in shared.split("/") if part]
-    folders = ["".join(parts[:depth]) for depth in range(len(parts) + 1)]
-    fits = [sum(bool(_LAYOUT.fullmatch(n.removeprefix(top))) for n in names) for top in folders]
-    return folders[fits.index(max(fits))]
-
-
-def _unexpected(name: str, where: str) -> FileError:
-    return FileError(
-        where,
-        f"holds {ascii(name[:100])}, expected rig.yaml, lidar/STEM.npy, cameras/NAME/STEM.png, "
-        "or a KITTI sequence or ROS 2 bag, with names of letters, digits, _, - and .",
-    )
+def _dataset_in(folder: Path) -> Path:
+    """The folder of the dataset: the first that holds more than one other folder."""
+    while len(inside := [*folder.iterdir()]) == 1 and inside[0].is_dir():
+        folder = inside[0]
+    return folder
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ PRAGMA journal_mode = WAL;
 PRAGMA synchronous = FULL;  -- what is acknowledged is on disk
 CREATE TABLE IF NOT EXISTS calibgraph_jobs (
     number INTEGER PRIMARY KEY, id TEXT UNIQUE, kind TEXT, state TEXT, request TEXT, name TEXT,
-    note TEXT, created_s REAL, started_s REAL, finished_s REAL, starts INTEGER, verdict TEXT,
+    created_s REAL, started_s REAL, finished_s REAL, starts INTEGER, verdict TEXT,
     cannot_tell INTEGER, error_kind TEXT, error TEXT
 );
 CREATE INDEX IF NOT EXISTS calibgraph_jobs_by_state ON calibgraph_jobs (state, number);
@@ -41,7 +41,6 @@ class JobRecord:
     state: JobState
     request: str
     name: str
-    note: str
     created_s: float
     started_s: float | None
     finished_s: float | None
@@ -92,10 +91,9 @@ class JobTable:
     def add(self, id: str, job: Job) -> JobRecord:
         """Add a job; it is durable when this returns."""
         (row,) = self.run(
-            "INSERT INTO calibgraph_jobs (id, kind, state, request, name, note, created_s, starts) "
-            f"VALUES (:id, :kind, 'queued', :request, :name, :note, :now, 0) RETURNING {_COLUMNS}",
-            id=id, kind=job.kind, request=job.model_dump_json(), name=job.name, note=job.note,
-            now=time.time(),
+            "INSERT INTO calibgraph_jobs (id, kind, state, request, name, created_s, starts) "
+            f"VALUES (:id, :kind, 'queued', :request, :name, :now, 0) RETURNING {_COLUMNS}",
+            id=id, kind=job.kind, request=job.model_dump_json(), name=job.name, now=time.time(),
         )  # fmt: skip
         return JobRecord(*row)
 

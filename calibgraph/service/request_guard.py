@@ -1,7 +1,4 @@
-"""What every request passes: its host and origin, its token, the size and time of its body.
-
-A token has a scope; the token file holds their hashes alone.
-"""
+"""What every request passes: its host and origin, its token, the size and time of its body."""
 
 import asyncio
 import hashlib
@@ -11,7 +8,6 @@ import time
 from base64 import b64decode
 from contextlib import suppress
 from pathlib import Path
-from typing import Literal, get_args
 from urllib.parse import SplitResult, urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
@@ -19,38 +15,24 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from calibgraph.errors import FileError
 from calibgraph.files import read_text, write_text
-from calibgraph.service.problems import Problem, problem_response
+from calibgraph.service.problems import Problem
 from calibgraph.service.requests import Settings
 
-TokenScope = Literal["read", "submit"]
-SCOPES: tuple[TokenScope, ...] = get_args(TokenScope)
-"""The second includes the first."""
+Tokens = frozenset[str]
+"""The SHA-256 of each token."""
 
-Tokens = dict[str, TokenScope]
-"""The scope of each token, by the token's SHA-256."""
-
-_LINE = re.compile(f"({'|'.join(SCOPES)}) ([0-9a-f]{{64}})")
+_LINE = re.compile("[0-9a-f]{64}")
 _REALM = 'Basic realm="calibgraph: any name, a token as the password"'
 
 STRICT_HEADERS = {
     "Content-Security-Policy": "default-src 'self'; object-src 'none'; base-uri 'none'; "
     "form-action 'self'; frame-ancestors 'none'",
     "X-Content-Type-Options": "nosniff",
-    "X-Frame-Options": "DENY",
     "Referrer-Policy": "same-origin",  # without a referrer a form has no Origin
-    "Cross-Origin-Opener-Policy": "same-origin",
     "Cross-Origin-Resource-Policy": "same-origin",
-    "Permissions-Policy": "camera=(), geolocation=(), microphone=()",
     "Cache-Control": "no-store",
 }
 """Of every answer that does not set its own."""
-
-DOCS_POLICY = (
-    "default-src 'none'; connect-src 'self'; img-src data: https://fastapi.tiangolo.com; "
-    "script-src 'unsafe-inline' https://cdn.jsdelivr.net; frame-ancestors 'none'; "
-    "style-src 'unsafe-inline' https://cdn.jsdelivr.net"
-)
-"""Of /docs, FastAPI's own page, which loads Swagger UI from there."""
 
 LOCAL_NAMES = ("localhost", "127.0.0.1", "::1")
 UPLOADS = "/v1/jobs/"
@@ -84,8 +66,7 @@ class RequestGuard:
             await self._app(scope, receive, send)
             return
 
-        path = scope["path"]
-        settings, is_upload = self._settings, path.startswith(UPLOADS)
+        settings, is_upload = self._settings, scope["path"].startswith(UPLOADS)
         body = _Body(receive, settings.recording_bytes if is_upload else settings.body_bytes)
         rest: asyncio.Task[None] | None = None
 
@@ -95,17 +76,17 @@ class RequestGuard:
                 rest = asyncio.create_task(body.drop())  # who still sends can read the answer
                 await asyncio.wait([rest], timeout=UNREAD_S)
                 headers = MutableHeaders(scope=message)
-                own = {"Connection": "close"} if not rest.done() else {}
-                own |= {"Content-Security-Policy": DOCS_POLICY} if path == "/docs" else {}
-                for name, value in (STRICT_HEADERS | own).items():
+                for name, value in STRICT_HEADERS.items():
                     headers.setdefault(name, value)
+                if not rest.done():
+                    headers["Connection"] = "close"
             await send(message)
 
         try:
             self._require_ours(scope, body.most_bytes)
             await self._app(scope, body.receive, send_with_headers)
         except Problem as problem:
-            await problem_response(problem)(scope, receive, send_with_headers)
+            await problem.response(scope, receive, send_with_headers)
         finally:
             if rest is not None:
                 rest.cancel()
@@ -119,8 +100,7 @@ class RequestGuard:
         if scope["method"] not in _SAFE and is_foreign:
             raise Problem(403, "the request comes from a page of another site")
         if scope["path"] != "/healthz":
-            needed: TokenScope = "read" if scope["method"] in _SAFE else "submit"
-            require_scope(self._tokens, headers.get("authorization", ""), needed)
+            require_token(self._tokens, headers.get("authorization", ""))
         length = headers.get("content-length", "0")
         if not length.isdecimal() or int(length) > most_bytes:
             raise _too_large(most_bytes)
@@ -167,22 +147,19 @@ def _split(url: str) -> SplitResult:
 
 
 def load_tokens(path: Path) -> Tokens:
-    """The tokens of a file: a line each, its scope and its hash."""
-    found: Tokens = {}
-    for number, line in enumerate(read_text(path).splitlines(), 1):
-        match = _LINE.fullmatch(line.strip())
-        if match is None:
-            expected = "expected a scope and a hash, as calibgraph serve --new-token writes"
+    """The hashes in a file, a line each."""
+    lines = [line.strip() for line in read_text(path).splitlines()]
+    for number, line in enumerate(lines, 1):
+        if not _LINE.fullmatch(line):
+            expected = "expected a hash, as calibgraph serve --new-token writes"
             raise FileError(path, f"line {number} is {line[:40]!r}, {expected}")
-        found[match[2]] = SCOPES[SCOPES.index(match[1])]
-    return found
+    return frozenset(lines)
 
 
-def add_token(path: Path, scope: TokenScope) -> str:
+def add_token(path: Path) -> str:
     """Make a token, which is kept nowhere, and add its hash to a file, which is made if missing."""
-    tokens, secret = load_tokens(path) if path.exists() else {}, secrets.token_urlsafe(32)
-    tokens[_hash(secret)] = scope
-    write_text(path, "".join(f"{each} {digest}\n" for digest, each in tokens.items()))
+    tokens, secret = load_tokens(path) if path.exists() else (), secrets.token_urlsafe(32)
+    write_text(path, "".join(f"{digest}\n" for digest in (*sorted(tokens), _hash(secret))))
     path.chmod(0o600)
     return secret
 
@@ -192,17 +169,12 @@ def _hash(token: str) -> str:
     return hashlib.sha256(token.encode()).hexdigest()
 
 
-def require_scope(tokens: Tokens | None, authorization: str, needed: TokenScope) -> None:
-    """Refuse a caller whose token, of Bearer or the password of Basic, lacks a scope."""
-    if tokens is None:
-        return
+def require_token(tokens: Tokens | None, authorization: str) -> None:
+    """Refuse a caller without a token, of Bearer or the password of Basic."""
     scheme, _, given = authorization.partition(" ")
     if scheme.lower() == "basic":
         with suppress(ValueError):
             given = b64decode(given, validate=True).decode().partition(":")[2]
-    scope = tokens.get(_hash(given.strip()))
-    if scope is None:
+    if tokens is not None and _hash(given.strip()) not in tokens:
         text = "give a token: Authorization: Bearer TOKEN"
         raise Problem(401, text, {"WWW-Authenticate": _REALM})
-    if SCOPES.index(scope) < SCOPES.index(needed):
-        raise Problem(403, f"this needs a token of scope {needed}, found {scope}")

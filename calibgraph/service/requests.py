@@ -16,7 +16,7 @@ JobKind = Literal["calibrate", "solve", "check"]
 
 RIG, TABLE, RECORDING = "rig", "correspondences", "recording"
 """Names of inputs: fields of the form, and in the job's folder."""
-TEXTS = ("settings", "name", "note")
+TEXTS = ("settings", "name")
 """Fields that are no inputs."""
 
 PARTS: Mapping[JobKind, Mapping[str, bool]] = {
@@ -59,15 +59,14 @@ class CalibrationSettings(SolveSettings):
 
     Attributes:
         frames: which, as ``--frames``: ``0:90:10`` or ``0,5,7``.
-        search: whether the guess may be far off.
-        search_deg, search_m: how far, per axis; the matcher's default if None.
+        search_deg, search_m: how far off the guess may be, per axis; 0: no search, None: the
+            matcher's default.
         time_limit_s: when to stop matching; at most half of the server's limit for a job.
     """
 
     frames: Frames | None = None
-    search: bool = True
-    search_deg: Annotated[float, Field(gt=0, le=45)] | None = None
-    search_m: Annotated[float, Field(gt=0, le=5)] | None = None
+    search_deg: Annotated[float, Field(ge=0, le=45)] | None = None
+    search_m: Annotated[float, Field(ge=0, le=5)] | None = None
     time_limit_s: Annotated[float, Field(gt=0)] | None = None
 
 
@@ -97,7 +96,6 @@ class Job(StrictNumbers):
     recordings: int = 0
     settings: dict[str, Any] = {}
     name: Annotated[str, StringConstraints(max_length=100), BeforeValidator(_printable)] = ""
-    note: Annotated[str, StringConstraints(max_length=2000), BeforeValidator(_printable)] = ""
 
 
 def recording_name(index: int) -> str:

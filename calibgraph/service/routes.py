@@ -52,7 +52,6 @@ class JobAnswer(BaseModel):
     kind: JobKind
     state: JobState
     name: str
-    note: str
     created: Annotated[datetime, Field(validation_alias="created_s")]
     started: Annotated[datetime | None, Field(validation_alias="started_s")]
     finished: Annotated[datetime | None, Field(validation_alias="finished_s")]

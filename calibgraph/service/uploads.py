@@ -2,14 +2,12 @@
 
 import secrets
 import shutil
-from collections.abc import AsyncGenerator
 from pathlib import Path
 
 from fastapi import Request
 from pydantic import ValidationError
 from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import FormData, UploadFile
-from starlette.formparsers import MultiPartException, MultiPartParser
 
 from calibgraph.files import describe
 from calibgraph.service.folders import INPUT, LOG, DataFolder
@@ -28,33 +26,16 @@ from calibgraph.service.requests import (
 MOST_TEXT_BYTES = 10**6
 
 
-class _Form(MultiPartParser):
-    """A form of which is known whether it is whole: a part that breaks off is left out silently."""
-
-    is_whole = False
-
-    def on_end(self) -> None:
-        self.is_whole = True
-
-
 async def receive_job(request: Request, kind: JobKind, folder: DataFolder) -> tuple[str, Job]:
     """Read the form of a job, which is on disk then; its id, which names its folder, and it."""
     if not request.headers.get("content-type", "").startswith("multipart/form-data"):
         raise Problem(415, "send a form: multipart/form-data")
-
-    async def chunks() -> AsyncGenerator[bytes]:
-        async for chunk in request.stream():
-            yield chunk
-        if not parser.is_whole:
-            raise MultiPartException("it breaks off; send it again")
-
-    parser = _Form(
-        request.headers, chunks(), max_files=MAX_RECORDINGS + 2,
-        max_fields=MAX_RECORDINGS + 5, max_part_size=MOST_TEXT_BYTES,
-    )  # fmt: skip
     try:
-        form = await parser.parse()
-    except (MultiPartException, LookupError) as error:
+        form = await request.form(
+            max_files=MAX_RECORDINGS + 2, max_fields=MAX_RECORDINGS + 5,
+            max_part_size=MOST_TEXT_BYTES,
+        )  # fmt: skip
+    except LookupError as error:
         raise Problem(400, f"the form cannot be read ({error})") from error
     try:
         return await run_in_threadpool(_keep, form, kind, folder)

@@ -215,7 +215,7 @@ def draw_visible_points(
 def _draw_scattered(rng: Rng, camera: Camera, count: int, depth_m: tuple[float, float]) -> Array:
     """(count, 3) points in the camera frame, in about the directions of the image."""
     low, high = np.log(depth_m)
-    if camera.model in ("omnidirectional", "equirectangular"):
+    if camera.model == "omnidirectional":
         rays = _draw_rays(rng, camera, count)
         return np.asarray(rays * np.exp(rng.uniform(low, high, (len(rays), 1))))
     spread = 1.2 * np.array([camera.width_px, camera.height_px]) / 2

@@ -26,9 +26,8 @@ def rig_of(name: str) -> Rig:
             ``walkley``: a pair 60 cm apart, 1920 x 1200, wider and distorted; ``surround``: six
             cameras all round, 1280 x 800, distorted, with little overlap; ``fisheye``: four
             fisheyes of 190 degrees, 1280 x 960, one to each side of a vehicle; ``omni``: two lenses
-            of the unified model, 200 degrees, 1280 x 1280, ahead and back; ``panorama``: one
-            equirectangular camera that sees all round, 2048 x 1024, above the LiDAR; ``sample``:
-            two cameras ahead and one to the left, 640 x 360, as in ``data/sample``.
+            of the unified model, 200 degrees, 1280 x 1280, ahead and back; ``sample``: two
+            cameras ahead and one to the left, 640 x 360, as in ``data/sample``.
 
     Raises:
         ValueError: if there is no such rig.
@@ -121,13 +120,6 @@ _RIGS: dict[str, list[Cameras]] = {
              "back": ((-0.4, 0.05, -0.25), (179, 9, 0))},
             (1280, 1280), (900.0, 898.5, 641.2, 637.4), (1.3, -0.02, 0.04, 0.0003, -0.0002),
             model="omnidirectional",
-        ),
-    ],
-    "panorama": [
-        _alike(
-            {"panorama": ((-0.1, 0.05, 0.25), (3.0, 2.0, -1.0))},
-            (2048, 1024), (2048 / (2 * np.pi), 1024 / np.pi, 2047 / 2, 1023 / 2),
-            model="equirectangular",
         ),
     ],
     "sample": [  # small images: two cameras ahead, and a distorted one to the left

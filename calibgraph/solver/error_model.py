@@ -168,14 +168,14 @@ def fit_errors(at: FittedObjective, findings: MatcherFindings, places: Places) -
         VarianceRatios(),
         start_values(model, at.T_camera_lidar),
     )
-    fit = fit_latent_poses(model, linear) if linear.is_determined() else None
+    fit = fit_latent_poses(model, linear)
     for _ in range(_ROUNDS):
         found = ratios if fit is None else estimate_variance_ratios(fit.linear, ratios)
         if fit is None or found.is_near(ratios):
             break
         model, ratios = replace(model, components=found.scale(prior)), found
         fit = fit_latent_poses(model, fit.linear)
-    return None if fit is None else replace(fit, ratios=ratios)
+    return replace(fit, ratios=ratios) if fit and fit.linear.is_determined() else None
 
 
 def split_frames(inliers: Objective, places: Places) -> list[Numbers]:

@@ -20,7 +20,7 @@ from calibgraph.graph.lens import LensTerm, LensVariable
 from calibgraph.graph.variables import lens_key
 from calibgraph.model.config import LensPart, Reported
 from calibgraph.model.findings import MatcherFindings, error_components
-from calibgraph.model.geometry import to_T_camera_lidar, to_T_lidar_camera
+from calibgraph.model.geometry import pose_rows, to_T_camera_lidar, to_T_lidar_camera
 from calibgraph.model.lens import LensEstimate, LensSigmas
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.solver.covariance import FittedObjective, positive_part
@@ -131,7 +131,7 @@ def considered_lens(camera: Camera, block: ProjectionBlock) -> LensVariable:
 
     And of the clock, where the motion of the LiDAR is known.
     """
-    parts: list[LensPart] = [] if camera.model == "equirectangular" else [*_LENS]
+    parts: list[LensPart] = [*_LENS]
     if block.motion is not None:
         parts += ["offset", "readout"] if camera.readout_sigma_s else ["offset"]
     return LensVariable.of(camera, parts, LensSigmas.calibrated(camera))
@@ -220,75 +220,52 @@ def moved_lenses(lenses: Lenses, fit: ErrorFit | None) -> tuple[Lenses, float]:
     moved, largest = {**lenses}, 0.0
     for number in fit.model.lenses:
         name, key = fit.model.cameras[number], lens_key(number)
-        values, sigmas = (
-            fit.linear.shared.atVector(key),
-            np.sqrt(np.diag(fit.linear.covariance_of([key]))),
-        )
+        values = fit.linear.shared.atVector(key)
+        sigmas = np.sqrt(np.diag(fit.linear.covariance_of([key])))
         moved[name] = lenses[name].moved_to(values)
         largest = max(largest, float((abs(values - lenses[name].values) / sigmas).max()))
     return moved, largest
 
 
-def lens_estimates(fit: ErrorFit) -> dict[str, tuple[LensEstimate, ...]]:
-    """Per camera whose lens is free, its parameters with their marginal."""
-    model, found = fit.model, {}
-    for number, term in model.lenses.items():
-        own = [lens_key(number), model.reported_keys[number]]
-        values, covariance = fit.linear.shared.atVector(own[0]), fit.linear.covariance_of(own)
-        sigmas = np.sqrt(np.diag(covariance))
-        with_pose = np.abs(covariance / np.outer(sigmas, sigmas))[:, len(values) :]
-        rows = zip(term.variable.free.parameters, sigmas, with_pose, strict=False)
-        found[model.cameras[number]] = tuple(
-            _estimate(term.variable, values, name, sigma, correlations=correlations)
-            for name, sigma, correlations in rows
-        )
-    return found
+def lens_estimates(fit: ErrorFit) -> tuple[dict[str, tuple[LensEstimate, ...]], dict[str, Array]]:
+    """Per camera whose lens is free, its parameters; and the marginal of pose, lens and clock.
 
-
-def lens_covariances(fit: ErrorFit) -> dict[str, Array]:
-    """Per camera whose lens is free, the (6 + k, 6 + k) joint marginal of pose, lens and clock.
-
-    Of xi in T_camera_lidar = exp(xi) estimate, then of the parameters in the order and the units of
-    :func:`lens_estimates`.
+    That is (6 + k, 6 + k), of xi in T_camera_lidar = exp(xi) estimate, then of the parameters in
+    their order and units.
     """
-    model, found = fit.model, {}
+    model, estimates, joints = fit.model, dict[str, tuple[LensEstimate, ...]](), {}
     for number, term in model.lenses.items():
-        joint = fit.linear.covariance_of([model.reported_keys[number], lens_key(number)])
-        units = [_unit(term.variable, name) for name in term.variable.free.parameters]
-        scale = np.array([-1.0] * 6 + units)  # of T_lidar_camera the tangent is -xi
-        found[model.cameras[number]] = joint * np.outer(scale, scale)
-    return found
+        own, key, name = pose_rows(number), lens_key(number), model.cameras[number]
+        lens, values = term.variable, fit.linear.shared.atVector(key)
+        before, after = (_in_units(lens, at) for at in (np.zeros(len(values)), values))
+        is_focal = np.equal(lens.free.parameters, FOCAL)
+        units = np.where(is_focal, before, 1.0) * lens.free.sigmas
+        rows = np.vstack([fit.rows[own], np.eye(model.size)[model.columns[key]]])
+        joint = rows @ fit.linear.joint_covariance @ rows.T
+        joint[:6, :6] = fit.covariance[own, own]
+        scale = np.append(np.full(6, -1.0), units)  # of T_lidar_camera the tangent is -xi
+        joints[name] = joint * np.outer(scale, scale)
+        sigmas = np.sqrt(np.diag(joints[name]))
+        with_pose = np.abs(joints[name] / np.outer(sigmas, sigmas))[6:, :6]
+        estimates[name] = tuple(
+            LensEstimate(
+                name=parameter,
+                unit=_UNITS.get(parameter, ""),
+                value=float(after[row]),
+                sigma=float(sigmas[6 + row]),
+                prior=float(before[row]),
+                prior_sigma=float(units[row]),
+                direction=_DIRECTIONS[int(with_pose[row].argmax())],
+                correlation=float(with_pose[row].max()),
+            )
+            for row, parameter in enumerate(lens.free.parameters)
+        )
+    return estimates, joints
 
 
-def _estimate(
-    lens: LensVariable, values: Array, name: str, sigma: float, *, correlations: Array
-) -> LensEstimate:
-    """One parameter, with standard deviation and correlation with the pose of its camera."""
-    most, unit = int(np.argmax(correlations)), _unit(lens, name)
-    before, after = (_in_its_unit(lens, name, v) for v in (np.zeros(len(values)), values))
-    return LensEstimate(
-        name=name,
-        unit=_UNITS.get(name, ""),
-        value=after,
-        sigma=float(sigma * unit),
-        prior=before,
-        prior_sigma=float(unit),
-        direction=_DIRECTIONS[most],
-        correlation=float(correlations[most]),
-    )
-
-
-def _unit(lens: LensVariable, name: str) -> float:
-    """The prior standard deviation of a parameter, in its unit."""
-    step = lens.free.sigmas[lens.free.parameters.index(name)]
-    of_rig = _in_its_unit(lens, name, np.zeros(len(lens.free)))
-    return step * of_rig if name == FOCAL else step
-
-
-def _in_its_unit(lens: LensVariable, name: str, values: Array) -> float:
-    """A parameter at some values, as people state it."""
-    camera, clock = lens.put_into(lens.camera, values), lens.free.clock_at(values)
-    k = camera.intrinsics_px
+def _in_units(lens: LensVariable, values: Array) -> Array:
+    """The parameters at some values, as people state them."""
+    k, clock = lens.put_into(lens.camera, values).intrinsics_px, lens.free.clock_at(values)
     known = {
         OFFSET: clock.offset_s,
         READOUT: clock.readout_s,
@@ -296,4 +273,5 @@ def _in_its_unit(lens: LensVariable, name: str, values: Array) -> float:
         CENTRE_X: k.cx,
         CENTRE_Y: k.cy,
     }
-    return known[name] if name in known else lens.free.coefficient(name, values)
+    names = lens.free.parameters
+    return np.array([known[n] if n in known else lens.free.coefficient(n, values) for n in names])

@@ -27,6 +27,7 @@ from calibgraph.solver.pairs import (
     rows_of_pair,
     usual_excess,
 )
+from calibgraph.solver.places import lengthen
 from calibgraph.solver.pnp import DAMPING
 from calibgraph.solver.two_pass import Objective, Optimum
 from factors import pose_sigmas
@@ -118,6 +119,8 @@ def fit_pair(
     T, held = np.stack([(near or start)[name] for name in names]), np.linalg.pinv(covariance_a)
     prior, rows = np.zeros((12, 12)), [rows_of_pair(names, term) for term in terms]
     prior[:6, :6], sigmas, stands = held, np.zeros(len(terms)), False
+    reach, slope = 1.0, 0.0
+    step: Array = np.zeros(12)
     for number in range(_MAX_STEPS):
         now, data, gradient = dict(zip(names, T, strict=True)), np.zeros((12, 12)), np.zeros(12)
         if not stands:
@@ -131,9 +134,13 @@ def fit_pair(
             gradient[own] += sums.gradient
         gradient[:6] += held @ local_coordinates(start[names[0]], invert(T[:1]))[0]
         hessian = prior + data
-        step = -np.linalg.solve(hessian + DAMPING * np.diag(np.diag(hessian)), gradient)
-        step *= min(1.0, _MAX_STEP / np.abs(step).max())
-        T = retract_all(T, np.asarray(step.reshape(2, 6)))
+        reach = lengthen(reach, float(gradient @ step) / slope) if slope else 1.0
+        step = -np.asarray(
+            np.linalg.solve(hessian + DAMPING * np.diag(np.diag(hessian)), gradient), np.float64
+        )
+        step *= min(reach, _MAX_STEP / np.abs(step).max())
+        slope = float(gradient @ step) if stands else 0.0
+        T = retract_all(T, step.reshape(2, 6))
         if np.abs(step).max() < _CONVERGED:
             break
     covariance = np.linalg.pinv(prior + data / usual_excess(terms), hermitian=True)

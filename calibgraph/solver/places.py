@@ -29,13 +29,11 @@ import numpy as np
 
 from calibgraph.arrays import Array
 from calibgraph.graph.components import VarianceRatios
-from calibgraph.graph.latent_poses import LatentPoseModel, to_ordering
+from calibgraph.graph.latent_poses import LatentPoseModel, right_jacobians, to_ordering
 from calibgraph.graph.lens import start_lenses
 from calibgraph.graph.variables import (
     CLOUD,
     DISTORTION,
-    aligned_key,
-    body_key,
     camera_key,
     matched_key,
     paired_key,
@@ -43,8 +41,8 @@ from calibgraph.graph.variables import (
 from calibgraph.model.geometry import (
     adjoints,
     invert_each,
+    pose_rows,
     retract_all,
-    to_T_camera_lidar,
     to_T_lidar_camera,
 )
 from calibgraph.model.pose_kernel import logarithms
@@ -58,6 +56,7 @@ TOLERANCE = 1e-6
 _FREE = 1e3  # rad and m: a standard deviation that no correspondences have
 _SHARES = 0.5 ** np.arange(12)
 """Of a step: the first that descends; mostly the whole step."""
+_FARTHEST, _LEAST = 2.5, 0.1  # steps at once, where the slope shows that it pays
 
 
 class Ties(NamedTuple):
@@ -86,7 +85,7 @@ class Ties(NamedTuple):
         """From (1 + M, 4, 4) to (1 + M, P, 4, 4) inverses; the scale is that of the loss."""
         away = (inverses @ shared[:, None]).reshape(-1, 4, 4)
         error = -logarithms(away)
-        turn, shape = _right_jacobians(error).reshape(covariance.shape), covariance.shape[:-1]
+        turn, shape = right_jacobians(error).reshape(covariance.shape), covariance.shape[:-1]
         error = error.reshape(shape)
         squared = (error * _times(_inverses(covariance), error)).sum(axis=-1)
         weight = (1.0 + squared / scale**2) ** -2
@@ -308,15 +307,22 @@ class Linearization:
         """Twice GTSAM's error."""
         of_data = float(sum(sums.cost.sum() for sums in (self.data, *self.pairs)))
         ties = self.ties.cost(self.model.components.robust_scale)
-        return of_data + ties + 2.0 * self.model.shared_graph.error(self.shared)
+        if self.model.lenses:  # whose priors are robust
+            return of_data + ties + 2.0 * self.model.shared_graph.error(self.shared)
+        return of_data + ties + 2.0 * self.shared_factors.error(self.shared.zeroVectors())
+
+    @cached_property
+    def gradient(self) -> Array:
+        """(n,) by the shared variables, places eliminated."""
+        gradient, own = self.shared_hessian[1].copy(), self.places.gradient.sum(axis=0)
+        gradient[: len(own)] += own
+        return gradient
 
     @cached_property
     def step(self) -> Array:
         """(n,) of the shared variables, by Gauss-Newton."""
-        gradient, own = self.shared_hessian[1].copy(), self.places.gradient.sum(axis=0)
-        gradient[: len(own)] += own
         scaled, units = unit_diagonal(self.hessian())
-        return -np.asarray(np.linalg.solve(scaled, gradient / units)) / units
+        return -np.asarray(np.linalg.solve(scaled, self.gradient / units)) / units
 
     def moved(self, share: float) -> Linearization:
         """The graph after a part of the step."""
@@ -331,20 +337,12 @@ class Linearization:
         shared = self.shared.retract(of_shared)
         return Linearization(model, shared, moved.reshape(self.inverses.shape))
 
-    def descend(self) -> Linearization | None:
-        """The graph after a step, shortened until it descends; None if no step does."""
-        for share in _SHARES:
-            tried = self.moved(share)
-            if tried.cost <= self.cost:
-                return tried
-        return None
-
     def is_determined(self) -> bool:
         """Whether every direction of every camera is: of a free one rounding leaves far more."""
         if not {*self.model.camera_keys} <= {*self.model.shared_graph.keyVector()}:
             return False  # nothing acts on a camera
         try:
-            variances = np.diag(self.covariance_of(self.model.reported_keys))
+            variances = np.diag(self.covariance_of(self.model.camera_keys))
         except np.linalg.LinAlgError:
             return False
         return bool(((variances > 0) & (variances < _FREE**2)).all())
@@ -378,7 +376,8 @@ class ErrorFit:
     Attributes:
         linear: the graph linearized there.
         change: of the cost by the last step, relative to it.
-        keys: of the poses that are reported.
+        is_of_mount: whether mounts are reported, with the lenses as the rig has them, whatever the
+            model reports.
         ratios: of its variance components.
         without_priors: the optimum without measured relative poses and priors, where some are
             measured.
@@ -386,7 +385,7 @@ class ErrorFit:
 
     linear: Linearization
     change: float
-    keys: Sequence[int]
+    is_of_mount: bool = False
     ratios: VarianceRatios = VarianceRatios()
     without_priors: ErrorFit | None = None
 
@@ -406,25 +405,38 @@ class ErrorFit:
         return self.linear.cost
 
     @cached_property
-    def covariance(self) -> Array:
-        """(6 N, 6 N) marginal of all reported poses, in their tangents."""
-        return self.linear.covariance_of(self.keys)
+    def _reported(self) -> tuple[Array, Array]:
+        of = "mount" if self.is_of_mount else self.model.of
+        return self.model.reported(self.linear.shared, of)
 
     @property
-    def T_lidar_camera(self) -> tuple[gtsam.Pose3, ...]:
-        """All reported poses, in the order of the cameras."""
-        return tuple(map(self.linear.shared.atPose3, self.keys))
+    def rows(self) -> Array:
+        """(6 N, n) derivative of all reported poses by the shared variables, in their tangents."""
+        return self._reported[1]
+
+    @cached_property
+    def by_lenses(self) -> Array:
+        """(6 N, 6 N) covariance of the reported poses by what is considered of their lenses."""
+        size = 6 * len(self.model.cameras)
+        found, considered = np.zeros((size, size)), self.model.lens_errors
+        for number, own in ({} if self.is_of_mount else considered).items():
+            found[pose_rows(number), pose_rows(number)] = own
+        return found
+
+    @cached_property
+    def covariance(self) -> Array:
+        """(6 N, 6 N) marginal of all reported poses, in their tangents."""
+        return self.rows @ self.linear.joint_covariance @ self.rows.T + self.by_lenses
 
     @property
     def T_camera_lidar(self) -> dict[str, Array]:
         """Per camera, (4, 4) as reported."""
-        poses = map(to_T_camera_lidar, self.T_lidar_camera)
-        return dict(zip(self.model.cameras, poses, strict=True))
+        return dict(zip(self.model.cameras, self._reported[0], strict=True))
 
-    @property
+    @cached_property
     def of_mount(self) -> ErrorFit:
         """The same optimum; the mounts are reported, with the lenses as the rig has them."""
-        return replace(self, keys=self.model.camera_keys)
+        return replace(self, is_of_mount=True)
 
     @property
     def distortion(self) -> tuple[Array, Array]:
@@ -461,19 +473,30 @@ def fit_latent_poses(
         relative_tolerance: relative change of the cost at which it stops.
     """
     present = start if start.model is model else start.with_model(model)
-    change = np.inf
+    change, reach = np.inf, 1.0
     for _ in range(MAX_ITERATIONS):
         try:
-            found = present.descend()
+            tried = ((share, present.moved(share)) for share in (reach, *_SHARES))
+            lower = ((share, each) for share, each in tried if each.cost <= present.cost)
+            share, found = next(lower, (0.0, present))
         except np.linalg.LinAlgError:
             return None
-        if found is None:  # this is the minimum, to rounding
-            return ErrorFit(present, 0.0, model.reported_keys)
+        if not share:  # this is the minimum, to rounding
+            return ErrorFit(present, 0.0)
         change = (present.cost - found.cost) / max(present.cost, np.finfo(float).tiny)
-        present = found
         if change <= relative_tolerance:
-            break
-    return ErrorFit(present, change, model.reported_keys)
+            return ErrorFit(found, change)
+        before, left = (float(each.gradient @ present.step) for each in (present, found))
+        reach, present = lengthen(share, left / before), found
+    return ErrorFit(present, change)
+
+
+def lengthen(share: float, left: float) -> float:
+    """The next step's length, where the last of this length has left so much of the slope.
+
+    A robust loss is flatter than its weights say, so that Gauss-Newton falls short.
+    """
+    return float(np.clip(share / max(1.0 - left, _LEAST), 1.0, _FARTHEST))
 
 
 def start_values(model: LatentPoseModel, T_camera_lidar: Mapping[str, Array]) -> Linearization:
@@ -482,8 +505,6 @@ def start_values(model: LatentPoseModel, T_camera_lidar: Mapping[str, Array]) ->
     poses = [*map(to_T_lidar_camera, T)]
     for of, numbers in (
         (camera_key, range(len(poses))),
-        (aligned_key, model.aligned),
-        (body_key, model.lens_errors),
         (matched_key, model.matched),
         (paired_key, model.paired),
     ):
@@ -501,17 +522,6 @@ def invert_scaled(hessian: Array) -> Array:
     scaled, units = unit_diagonal(hessian)
     inverse = np.linalg.inv(scaled)
     return np.asarray((inverse + inverse.T) / 2 / np.outer(units, units))
-
-
-def _right_jacobians(twists: Array) -> Array:
-    """(f, 6, 6) derivatives of Exp(-xi) Exp(xi + d) by d, of (f, 6) small xi, to fourth order."""
-    ad = np.zeros((len(twists), 6, 6))
-    for first, (x, y, z) in ((0, twists[:, :3].T), (3, twists[:, 3:].T)):
-        ad[:, first + 2, 1], ad[:, first, 2], ad[:, first + 1, 0] = x, y, z
-        ad[:, first + 1, 2], ad[:, first + 2, 0], ad[:, first, 1] = -x, -y, -z
-    ad[:, 3:, 3:] = ad[:, :3, :3]
-    square = ad @ ad
-    return np.asarray(np.eye(6) - ad / 2 + square / 6 - square @ ad / 24)
 
 
 def _poses(values: gtsam.Values, keys: Iterable[int]) -> Array:

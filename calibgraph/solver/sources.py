@@ -83,21 +83,21 @@ def predict_variances(errors: ErrorFit) -> dict[int, Array]:
     The information of places is repeated, and so are the residuals that show the distortion; that
     of what they all share is not.
     """
-    linear, found = errors.linear, {}
-    at = linear.model.columns_of(errors.keys)
+    linear, rows, found = errors.linear, errors.rows, {}
     for times in TIMES:
         whole = linear.hessian(times)
         if linear.model.is_distorted:
             own = linear.model.columns[DISTORTION]
             more = (times - 1) * linear.model.components.distortion_information
             whole[np.ix_(own, own)] += more
-        found[times] = np.diag(invert_scaled(whole))[at]
+        found[times] = np.diag(rows @ invert_scaled(whole) @ rows.T + errors.by_lenses)
     return found
 
 
 def variances_by_source(errors: ErrorFit) -> Variances:
     """Per source but the matches, (6 N,) of its part of the variances of all cameras."""
-    return {**_of_shared(errors), PLACES: _of_places(errors)}
+    lenses = np.diag(errors.by_lenses)
+    return {**_of_shared(errors), LENSES: lenses, PLACES: _of_places(errors)}
 
 
 def _of_shared(fit: ErrorFit) -> Variances:
@@ -106,9 +106,9 @@ def _of_shared(fit: ErrorFit) -> Variances:
     A factor with the whitened Jacobian A adds C A^T A C.
     """
     linear, factors = fit.linear, fit.linear.shared_factors
-    covariance = linear.joint_covariance[linear.model.columns_of(fit.keys)]
+    covariance = fit.rows @ linear.joint_covariance
     found = dict.fromkeys(
-        (COMMON, PAIRS, LENSES, ESTIMATED, *_DISTORTIONS, PRIORS), np.zeros(len(covariance))
+        (COMMON, PAIRS, ESTIMATED, *_DISTORTIONS, PRIORS), np.zeros(len(covariance))
     )
     for number in range(factors.size()):
         factor = factors.at(number)
@@ -121,9 +121,9 @@ def _of_shared(fit: ErrorFit) -> Variances:
             for name, part in zip(_DISTORTIONS, (moved**2).T, strict=True):
                 found[name] = found[name] + part
             continue
-        source = PAIRS if "n" in letters else COMMON if letters & {"m", "o", "y"} else PRIORS
-        if "m" not in letters and letters & {"l", "b"}:
-            source = ESTIMATED if "l" in letters else LENSES
+        source = PAIRS if "n" in letters else COMMON if letters & {"m", "o"} else PRIORS
+        if "m" not in letters and "l" in letters:
+            source = ESTIMATED
         found[source] = found[source] + (moved**2).sum(axis=1)
     return found
 
@@ -131,7 +131,7 @@ def _of_shared(fit: ErrorFit) -> Variances:
 def _of_places(fit: ErrorFit) -> Array:
     """(6 N,) the part that the frames of a place share, beyond their scatter."""
     linear, model, parts = fit.linear, fit.linear.model, fit.linear.model.components
-    across = linear.joint_covariance[model.columns_of(fit.keys), : model.touched]
+    across = fit.rows @ linear.joint_covariance[:, : model.touched]
     turn, shared = linear.ties.turn[1:], parts.at_place - parts.scatter_at_place
     part = turn @ shared.swapaxes(0, 1)[model.matched] @ turn.swapaxes(-1, -2)
     of_cloud = linear.places.cloud.variances_by(linear.ties.covariance[0], across)

@@ -29,6 +29,7 @@ _LAST_FRAMES = 20  # of which it is kept whether they agree with the estimate
 _ABSORBED = np.array([[name == one for one in ("given", "used", "absorbed")] for name in COUNTS])
 _UNUSUAL = 25.0  # squared sigmas of a six-vector
 _TOTAL_KEPT = 1 - 1 / 2000  # of the total scatter, from frame to frame
+_SEEN = 3000  # at most, of the matches whose directions and distances are those of scenes
 _LENS_KEPT = 0.7  # of the errors by a lens, from epoch to epoch: scenes drawn for one scatter
 
 
@@ -280,8 +281,8 @@ def _consider_lens(state: State, camera: int, matches: CameraBlock) -> Array:
     if before.shape == columns.shape:  # else motion became known, or none yet
         columns = columns + before
     kept = state.matches_of(camera)  # in more directions than those of one epoch
-    seen = block if kept is None else kept[0].select(kept[1]).with_scale(state.scales[camera])
-    found = error_by_lens(lens, columns, seen, T, of=state.config.of)
+    seen = matches if kept is None else kept[0].select_evenly(_SEEN)
+    found = error_by_lens(lens, columns, seen.block, T, of=state.config.of)
     errors = np.zeros((6, 6)) if found is None else found
     if (known := state.lens_errors[camera]).any():
         errors = _LENS_KEPT * known + (1 - _LENS_KEPT) * errors

@@ -116,9 +116,9 @@ def _counts(state: State, camera: int) -> dict[str, int]:
 
 def second_moments(estimate: Estimate) -> Array:
     """(6 n, 6 n) of the mounts about the estimates."""
-    window, keys = estimate.window, estimate.window.model.camera_keys
-    away = logarithms(estimate.T_camera_lidar @ invert_each(window.T_camera_lidar(keys))).ravel()
-    return np.asarray(window.covariance(keys) + np.outer(away, away))
+    mounts, covariance = estimate.window.reported("mount")
+    away = logarithms(estimate.T_camera_lidar @ invert_each(mounts)).ravel()
+    return covariance + np.outer(away, away)
 
 
 def to_calibration(state: State, estimate: Estimate) -> Calibration:

@@ -4,27 +4,21 @@ from __future__ import annotations
 
 import gc
 import signal
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import islice
 from pathlib import Path
 from types import FrameType
 
-from calibgraph.errors import CalibrationError, DatasetError, FileError
-from calibgraph.io.bags import BagOptions
-from calibgraph.io.dataset import load_dataset
-from calibgraph.matching.burnt_in import hide_burnt_in
-from calibgraph.matching.protocol import FullMatcher, Matcher
-from calibgraph.matching.same_images import require_different_images
+from calibgraph.errors import CalibrationError, FileError
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.config import Config
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import START
 from calibgraph.report.as_json import print_line, require_stdout
 from calibgraph.tracking.assessment import Update, json_lines
-from calibgraph.tracking.dataset_frames import DatasetDrive
 from calibgraph.tracking.durable import DurableCalibrator
 from calibgraph.tracking.frames import Item, frames_of
 from calibgraph.tracking.tracker import UNSOLVABLE, IncrementalCalibrator, warm_up_tracker
@@ -33,54 +27,25 @@ Notify = Callable[[str], None]
 
 STATE_FOLDER = "state"
 _TOGETHER = 50  # frames of a table that are taken in by one write
-
-
-def open_drive(
-    source: Sequence[Path], rig: Rig, config: Config, *, matcher: Matcher, every: int = 1,
-    interval_s: float | None = None, bag: BagOptions | None = None,
-) -> DatasetDrive:  # fmt: skip
-    """Dataset folders or bags as one drive.
-
-    Args:
-        source: the folders.
-        rig: the initial guess.
-        config: settings.
-        matcher: of the frames.
-        every: match every so-many-th frame.
-        interval_s: between neighbouring clouds of folders, whose registration shows the motion.
-        bag: how bags are read.
-
-    Raises:
-        CalibrationError: if they cannot be used.
-    """
-    try:
-        data = load_dataset(source, rig, bag=bag, interval_s=interval_s)
-    except ValueError as error:  # of an option: a wrong argument of the user
-        raise DatasetError(str(error)) from error
-    full = FullMatcher(matcher)
-    require_different_images(data, rig)
-    data = hide_burnt_in(replace(data, frames=data.frames[::every]), rig)
-    return DatasetDrive(data, full, config.changed(stage1=full.stage1))
+_COUNTS = {"updates": "updates", "left out": "left out", "known": "known from before"}
 
 
 def track(
     rig: Rig,
-    source: Sequence[Path],
+    source: str,
     *,
     config: Config,
     out: Path,
     notify: Notify,
-    drive: DatasetDrive | None = None,
 ) -> tuple[Calibration, list[Path]]:
     """Track a source until it ends or a signal comes; a line of JSON per update on stdout.
 
     Args:
         rig: the initial guess.
-        source: a table, or -; the folders of a drive.
+        source: a table, or "-" for standard input.
         config: settings.
         out: folder for the state and the result.
         notify: called with warnings and events as sentences.
-        drive: of which the frames are; None: of the source.
 
     Returns:
         The last estimate; the files written.
@@ -90,103 +55,75 @@ def track(
     """
     require_stdout()
     rig.require_cameras()
-    state, waits = out / STATE_FOLDER, str(source[0]) == "-"  # frames come at their own times
+    state, waits = out / STATE_FOLDER, source == "-"  # frames come at their own times
     with _stopped_by_signals() as stop:
         if waits:
             warm_up_tracker()
-        if drive is None:
-            items: Iterator[Item] = frames_of(str(source[0]))
-            calibrator = DurableCalibrator(state, rig, config)
-        else:
-            begin = partial(_first_rig, drive, rig, notify)
-            calibrator = DurableCalibrator(state, rig, drive.config, begin=begin)
-            items = drive.items(calibrator.tracker)
+        items = frames_of(source)
+        calibrator = DurableCalibrator(state, rig, config)
         if calibrator.resumed:
             notify(f"going on after frame {calibrator.tracker.frame}")
         gc.freeze()  # what is loaded by now stays: each full collection would visit it, for 0.1 s
-        run = Run(calibrator, notify)
         with calibrator:
-            run.follow(items, 1 if waits or drive is not None else _TOGETHER, stop)
-            if calibrator.tracker.frame is None and not stop.received:
-                held = f"held no frame that could be used ({run.left_out} left out); check it"
-                raise FileError("standard input" if waits else source[0], held)
-            result = _result(calibrator.tracker, rig, state)
-    run.report_counts()
+            given = iter(lambda: stop.next_of(items, 1 if waits else _TOGETHER), [])
+            counts = _follow(calibrator, given, notify)
+            last = calibrator.tracker.frame
+            if last is None and not stop.received:
+                held = f"held no frame that could be used ({counts['left out']} left out); check it"
+                raise FileError("standard input" if waits else source, held)
+            result = _result(calibrator.tracker, state)
+    notify(", ".join(f"{counts[key]} {text}" for key, text in _COUNTS.items()))
+    if counts["known"] and not counts["updates"]:
+        found = f"no frame comes after {last}"
+        notify(f"warning: {found}; if that number is wrong, choose another --out")
     return result, [result.save(out)]
 
 
-@dataclass
-class Run:
-    """Frames in, updates out, and what became of the frames.
+def _follow(
+    calibrator: DurableCalibrator, given: Iterator[list[Item]], notify: Notify
+) -> Counter[str]:
+    """Update with each frame until there are no more; counts of frames.
 
-    Attributes:
+    Each update is printed once it is on disk; after a crash, those of the last write come first,
+    since they may not have been printed. A reader that goes away ends the run.
+
+    Args:
         calibrator: takes the frames in.
+        given: the frames, those of one write together.
         notify: called with warnings and events as sentences.
-        updates: frames taken in.
-        left_out: input that was not a frame, or a frame that was left out.
-        skipped: frames at the beginning that an earlier run had taken in already.
     """
-
-    calibrator: DurableCalibrator
-    notify: Notify
-    updates: int = 0
-    left_out: int = 0
-    skipped: int = 0
-
-    def follow(self, items: Iterator[Item], together: int, stop: Stop) -> None:
-        """Update with each frame until there are no more, or a signal has come.
-
-        Each update is printed once it is on disk; after a crash, those of the last write come
-        first, since they may not have been printed. A reader that goes away ends the run.
-
-        Args:
-            items: the frames.
-            together: how many are taken in by one write, if they are at hand.
-            stop: interrupts the wait for the next frame.
-        """
-        known = self.calibrator.tracker.frame if self.calibrator.resumed else None
-        try:
-            self._report(self.calibrator.repeated)
-            while some := stop.next_of(items, together):
-                errors = [one for one in some if isinstance(one, CalibrationError)]
-                given = [one for one in some if not isinstance(one, CalibrationError)]
-                frames = [one for one in given if known is None or one.frame > known]
-                if len(frames) < len(given) and not self.skipped:
-                    self.notify(
-                        f"frame {given[0].frame} and others up to {known} are known: skipped"
-                    )
-                self.skipped += len(given) - len(frames)
-                for found in [*errors, *self.calibrator.update_all(frames)]:
-                    if isinstance(found, CalibrationError):
-                        self.left_out += 1
-                        self.notify(f"left out: {found}")
-                    else:
-                        self.updates += len(found)
-                        self._report(found)
-        except BrokenPipeError:
-            self.notify("stopped: the reader of standard output is gone; all updates are on disk")
-
-    def report_counts(self) -> None:
-        """Notify of what became of the frames."""
-        self.notify(
-            f"{self.updates} updates, {self.left_out} left out, {self.skipped} known from before"
-        )
-        if self.skipped and not self.updates:
-            found = f"no frame comes after {self.calibrator.tracker.frame}"
-            self.notify(f"warning: {found}; if that number is wrong, choose another --out")
-
-    def _report(self, updates: Sequence[Update]) -> None:
-        for update, line in zip(updates, json_lines(updates), strict=True):
-            print_line(line)
-            for event in update.events:
-                self.notify(f"frame {event.detected_frame}: {event}")
+    known = calibrator.tracker.frame if calibrator.resumed else None
+    counts = Counter[str]()
+    try:
+        _report(calibrator.repeated, notify)
+        for some in given:
+            errors = [one for one in some if isinstance(one, CalibrationError)]
+            right = [one for one in some if not isinstance(one, CalibrationError)]
+            frames = [one for one in right if known is None or one.frame > known]
+            if len(frames) < len(right) and not counts["known"]:
+                notify(f"frame {right[0].frame} and others up to {known} are known: skipped")
+            counts["known"] += len(right) - len(frames)
+            for found in [*errors, *calibrator.update_all(frames)]:
+                if isinstance(found, CalibrationError):
+                    counts["left out"] += 1
+                    notify(f"left out: {found}")
+                else:
+                    counts["updates"] += len(found)
+                    _report(found, notify)
+    except BrokenPipeError:
+        notify("stopped: the reader of standard output is gone; all updates are on disk")
+    return counts
 
 
-def _result(tracker: IncrementalCalibrator, guess: Rig, state: Path) -> Calibration:
-    """That of the guess, not of where the first batch has located it.
+def _report(updates: Sequence[Update], notify: Notify) -> None:
+    for update, line in zip(updates, json_lines(updates), strict=True):
+        print_line(line)
+        for event in update.events:
+            notify(f"frame {event.detected_frame}: {event}")
 
-    A camera without an estimate fails at the end, as one that `calibrate` does not find.
-    """
+
+def _result(tracker: IncrementalCalibrator, state: Path) -> Calibration:
+    """The last estimate; a camera without one fails, as one that `calibrate` does not find."""
     try:
         result = tracker.calibration()
     except UNSOLVABLE as error:
@@ -201,16 +138,7 @@ def _result(tracker: IncrementalCalibrator, guess: Rig, state: Path) -> Calibrat
         ))
         for name, one in result.camera_verdicts.items()
     }  # fmt: skip
-    return replace(result, initial_rig=guess, camera_verdicts=verdicts)
-
-
-def _first_rig(drive: DatasetDrive, guess: Rig, notify: Notify) -> Rig:
-    """The guess at the poses of the first frames' batch; a warning if they are not reliable."""
-    verdict = drive.start.verdict
-    if verdict.status == "FAIL":
-        reasons = "; ".join(verdict.reasons)
-        notify(f"warning: the first frames give no reliable start: {reasons}")
-    return guess.moved_to(drive.start.rig.T_camera_lidar)
+    return replace(result, camera_verdicts=verdicts)
 
 
 @dataclass

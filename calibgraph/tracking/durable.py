@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import errno
 import sqlite3
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from types import TracebackType
@@ -57,21 +57,13 @@ class DurableCalibrator:
         folder: where the state is kept; one process at a time.
         rig: cameras with their initial guess.
         config: settings; the preset ``auto`` if None.
-        begin: computes a better guess than ``rig``; called only if there is no state yet.
 
     Raises:
         FileError: if another process uses the folder, or the state in it is damaged, of another
             version, another rig or other settings.
     """
 
-    def __init__(
-        self,
-        folder: Path | str,
-        rig: Rig,
-        config: Config | None = None,
-        *,
-        begin: Callable[[], Rig] | None = None,
-    ) -> None:
+    def __init__(self, folder: Path | str, rig: Rig, config: Config | None = None) -> None:
         folder = Path(folder)
         self._database = StateDatabase(folder)
         self.tracker: IncrementalCalibrator
@@ -82,7 +74,7 @@ class DurableCalibrator:
                 self._resume(folder, *rows)
                 _require_same(folder, self.tracker, rig, config or Config())
             else:
-                self.tracker = IncrementalCalibrator(begin() if begin else rig, config)
+                self.tracker = IncrementalCalibrator(rig, config)
                 self._database.write([], self.tracker.to_bytes())
         except BaseException:
             self.abandon()

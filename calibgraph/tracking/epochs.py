@@ -5,20 +5,26 @@ from __future__ import annotations
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.model.geometry import invert_each, local_coordinates, retract_all, to_T_lidar_camera
+from calibgraph.model.geometry import (
+    invert_each,
+    local_coordinates,
+    retract_all,
+    to_T_lidar_camera,
+)
 from calibgraph.model.pose_kernel import logarithms
 from calibgraph.solver.robust import median_norm, robust_spread, scale_from
 from calibgraph.solver.within_place import WEAK
 from calibgraph.tracking.absorption import add_to_totals, count_epoch
 from calibgraph.tracking.estimate import EpochGraph, locate_places
 from calibgraph.tracking.events import Event
-from calibgraph.tracking.gate import Gated, frame_sums
+from calibgraph.tracking.gate import Gated, sums_of
 from calibgraph.tracking.moves import report_drift, select_walk, shift_between, update_evidence
 from calibgraph.tracking.state import STRENGTHS, State
 from calibgraph.tracking.sums import Numbers, Sums
 from factors import to_runs
 
-_GATE_STEPS = 4  # by the Hessian by weights, which descend: each leaves a third of the way
+_GATE_STEPS = 4  # by the Hessian by weights, which descend: each leaves a fifth of the way
+_SMALL_STEP = 1e-2  # squared sigmas of independent matches
 
 
 def close_epoch(state: State, graph: EpochGraph) -> list[Event]:
@@ -53,14 +59,14 @@ def close_epoch(state: State, graph: EpochGraph) -> list[Event]:
 def _newest(state: State, graph: EpochGraph) -> Array:
     """(n, 4, 4) T_camera_lidar at the minimum of each camera's matches, where the gate is drawn.
 
-    Of all of them, as in a batch: that of the matches within a gate is drawn to where the gate was
-    before. Of a camera that drifts, or has none, that of Eq. 5, which later epochs have a part in.
+    Of all that are kept, as in a batch: that of the matches within a gate is drawn to where the
+    gate was before. Of a camera that drifts, or has none, that of Eq. 5.
     """
     newest = retract_all(state.references, graph.equation_5(state.all_sums()))
     own = {c: state.matches_of(c) for c in np.flatnonzero(state.walk == 0).tolist()}
     blocks = {c: one[0].with_scale(state.scales[c]) for c, one in own.items() if one is not None}
     cameras = [*blocks]
-    older, start = state.ungated[cameras], state.references[cameras]
+    older, start = state.walks[cameras, 0], state.references[cameras]
     at = start
     for _ in range(_GATE_STEPS if cameras else 0):
         poses = map(to_T_lidar_camera, at)
@@ -69,7 +75,10 @@ def _newest(state: State, graph: EpochGraph) -> Array:
         pull = np.array([sums.gradient for sums in found]) + older.gradient
         pull += (older.hessian @ steps)[..., 0]
         whole = np.array([sums.hessian for sums in found]) + older.hessian + WEAK
-        at = retract_all(at, np.asarray(-np.linalg.solve(whole, pull[..., None])[..., 0]))
+        step = np.asarray(-np.linalg.solve(whole, pull[..., None])[..., 0])
+        at = retract_all(at, step)
+        if (step * pull).sum(axis=1).min() > -_SMALL_STEP:
+            break
     newest[cameras] = at
     return newest
 
@@ -85,7 +94,6 @@ def _set_references(state: State, references: Array) -> None:
     state.walks = state.walks.shift_reference(
         np.broadcast_to(steps[:, None], (*state.walks.frames.shape, 6))
     )
-    state.ungated = state.ungated.shift_reference(steps)
     state.steps, state.shared = state.steps - steps, state.shared - steps
     if state.drift is not None:
         state.drift = state.drift.about(steps)
@@ -114,21 +122,18 @@ def _regate(state: State, camera: int, places: Numbers) -> None:
         least = max(robust_spread(sizes), raw.least_spread)
         scale = scale_from(robust_spread(sizes_px), least, state.config)
     within = sizes_px * median_norm(raw.information) <= scale.gate_px
-    gated = Gated(
-        poses[-1], raw, within, np.add.reduceat(within, raw.frame_edges[:-1], dtype=float)
-    )
+    starts = raw.frame_edges[:-1]
+    gated = Gated(poses[-1:], raw, within, np.add.reduceat(within, starts, dtype=float))
     state.put(camera, scales=scale, share=gated.usual_share)
     newest = gated.select(epochs == epochs[-1]) if state.walk[camera] else gated
     if newest.enough.any():
         state.put(camera, curvature=newest.curvature(scale))
     within = np.where(np.repeat(gated.enough, frames), within, own[1])
-    counts = np.add.reduceat(within, raw.frame_edges[:-1], dtype=np.int64)
+    counts = np.add.reduceat(within, starts, dtype=float)
     steps = _linearized_at(state, camera, epochs, places[rows])
     poses = retract_all(np.tile(state.references[camera], (len(steps), 1, 1)), steps)
-    runs = to_runs(np.concatenate([[0], counts.cumsum()]))
-    here = raw.with_scale(scale).select(within).run_sums(poses, runs)
-    sums = frame_sums(here, state.curvature[camera], -steps, counts.astype(np.float64))
     state.put(camera, blocks=(raw,), inliers=(within,))
+    sums = sums_of(state, {camera: Gated(poses, raw, within, counts)})
     state.sums = state.sums.replace_at((rows, camera), sums)
 
 
@@ -155,13 +160,12 @@ def _summarize_oldest(state: State) -> None:
     update_evidence(state, epoch, by_places)
     for camera in range(len(state.names)):
         select_walk(state, camera)
-    ungated = Sums.stack([_drop_oldest(state, camera) for camera in range(len(state.names))])
+    for camera in range(len(state.names)):
+        _drop_oldest(state, camera)
     walks = state.walks + Sums(np.repeat(epoch.packed[:, None], len(STRENGTHS), axis=1))
     variance = state.walk_variance(STRENGTHS, size)
     over = np.repeat(state.overconfidence[:, None], len(STRENGTHS), axis=1)
-    state.walks, kept = walks.after_walk(np.broadcast_to(variance, (*over.shape, 6)), over)
-    each = np.arange(len(state.walk))
-    state.ungated = (state.ungated + ungated) * kept[each, state.walk]
+    state.walks = walks.after_walk(np.broadcast_to(variance, (*over.shape, 6)), over)
     state.places = state.places.add(names, frames).bounded()
     for camera, before in enumerate(drifted):
         if state.walk[camera]:
@@ -173,18 +177,10 @@ def _summarize_oldest(state: State) -> None:
     state.sums, state.sizes, state.poses = state.sums[size:], state.sizes[1:], state.poses[1:]
 
 
-def _drop_oldest(state: State, camera: int) -> Sums:
-    """Drop a camera's matches of the oldest epoch; the sums of all of them, whatever the gate."""
-    own, found = state.matches_of(camera), Sums.zeros()
-    if own is None:
-        return found
-    is_old = own[0].frame <= state.numbers[state.sizes[0] - 1]
-    raw, kept = own[0].select(is_old), own[0].select(~is_old)
-    inliers = own[1][~is_old]
-    state.put(camera, blocks=(kept,) if len(kept) else (), inliers=(inliers,) if len(kept) else ())
-    if not len(raw):
-        return found
-    pose = to_T_lidar_camera(state.poses[0, camera])
-    here = raw.with_scale(state.scales[camera]).sums(pose)
-    step = pose.localCoordinates(to_T_lidar_camera(state.references[camera]))
-    return found.change(hessian=here.hessian, gradient=here.gradient + here.hessian @ step)
+def _drop_oldest(state: State, camera: int) -> None:
+    """Drop a camera's matches of the oldest epoch."""
+    own = state.matches_of(camera)
+    if own is not None:
+        kept = own[0].frame > state.numbers[state.sizes[0] - 1]
+        left = ((own[0].select(kept),), (own[1][kept],)) if kept.any() else ((), ())
+        state.put(camera, blocks=left[0], inliers=left[1])

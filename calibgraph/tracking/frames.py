@@ -5,7 +5,7 @@ A line of JSON holds a frame::
     {"frame": 7, "cameras": {"left": {"u_px": [...], "v_px": [...],
                                       "x_m": [...], "y_m": [...], "z_m": [...]}}}
 
-Optional in a camera: ``confidence``; ``i_uu_px``, ``i_uv_px`` and ``i_vv_px``; ``point_index``.
+Optional in a camera: ``confidence``; ``i_uu_px``, ``i_uv_px`` and ``i_vv_px``.
 Optional beside ``frame``: ``stamp_ns``; ``place``, where the vehicle is, a name or a number;
 ``twist_per_s``, the six columns ``wx_rad_s`` to ``vz_m_s`` of a table; and ``metadata``, as there.
 """
@@ -48,7 +48,7 @@ PLACE = "place"
 """Key of a frame's metadata: the name of the place that it is of."""
 
 _LONGEST_PLACE = 200
-_DATASET = "to track a dataset, say what matches its frames: --matcher structure"
+_DATASET = "match its frames first, with `calibgraph match` or as in docs/tracking.md"
 _FINDINGS_PER_FRAME = (
     "systematic_rotation_rad", "systematic_translation_m", "camera_share",
     "elevation_rad", "elevation_stretch", "scan_motion_m",
@@ -136,7 +136,6 @@ class CameraColumns(BaseModel):
     i_uu_px: list[float] = []
     i_uv_px: list[float] = []
     i_vv_px: list[float] = []
-    point_index: list[Int64] = []
 
     @model_validator(mode="after")
     def _require_whole_table(self) -> Self:
@@ -172,7 +171,7 @@ class FrameLine(BaseModel):
         counts = [len(camera.u_px) for camera in cameras]
         n = sum(counts)
 
-        def columns(kind: type, **otherwise: float) -> Any:
+        def columns(**otherwise: float) -> Any:
             """(n, k); with a value for cameras that do not give one, None if none does."""
             if not any(getattr(one, key) for one in cameras for key in otherwise):
                 return None
@@ -180,11 +179,11 @@ class FrameLine(BaseModel):
                 [v for one in cameras for v in getattr(one, key) or [value] * len(one.u_px)]
                 for key, value in otherwise.items()
             ]
-            return np.array(rows, kind).T.copy()
+            return np.array(rows, np.float64).T.copy()
 
-        coordinates = columns(float, **dict.fromkeys(COORDINATES, np.nan))
+        coordinates = columns(**dict.fromkeys(COORDINATES, np.nan))
         coordinates = np.zeros((0, 5)) if coordinates is None else coordinates
-        confidence, indices = columns(float, confidence=1.0), columns(np.int64, point_index=-1)
+        confidence = columns(confidence=1.0)
         table = Correspondences(
             cameras=tuple(self.cameras),
             camera_index=np.repeat(np.arange(len(cameras), dtype=np.int32), counts),
@@ -192,9 +191,8 @@ class FrameLine(BaseModel):
             pixels_px=coordinates[:, :2].copy(),
             points_lidar_m=coordinates[:, 2:].copy(),
             confidence=as_confidence(np.ones(n) if confidence is None else confidence[:, 0]),
-            information_px=columns(float, **dict(zip(INFORMATION, (1.0, 0.0, 1.0), strict=True))),
+            information_px=columns(**dict(zip(INFORMATION, (1.0, 0.0, 1.0), strict=True))),
             stamp_ns=None if self.stamp_ns is None else np.full(n, self.stamp_ns),
-            point_index=None if indices is None else indices[:, 0],
             twist_per_s=np.tile(self.twist_per_s, (n, 1)) if self.twist_per_s and n else None,
             metadata=self.metadata,
         )

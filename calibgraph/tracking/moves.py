@@ -487,7 +487,7 @@ def _restart_camera(
     state.put(
         camera,
         blocks=(), inliers=(), outliers=(), agreements=(), moved_at=state.updates, absent=0,
-        walks=Sums.zeros(len(STRENGTHS)), evidence=0.0, walk=0, ungated=Sums.zeros(),
+        walks=Sums.zeros(len(STRENGTHS)), evidence=0.0, walk=0,
     )  # fmt: skip
     absorb_again(state, camera, blocks, T_camera_lidar)
 
@@ -523,9 +523,7 @@ def _sums_since(state: State, detected: DetectedStep) -> Sums:
         T = refine(raw, start, scale, state.config)
         gated = Gated.at(T, raw, scale)
         if gated.counts.sum() >= MIN_MATCHES:
-            own = sums_of(state, {camera: gated}, together=True)[0]
-            frames = np.array(float(raw.frames))
-            found = found.replace_at(camera, own.change(frames=frames))
+            found = found.replace_at(camera, sums_of(state, {camera: gated}).total())
     return found
 
 

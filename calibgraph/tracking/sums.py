@@ -154,8 +154,8 @@ class Sums:
         moved = (self.hessian @ steps[..., None])[..., 0]
         return self.change(gradient=self.gradient + moved)
 
-    def after_walk(self, variance: Array, overconfidence: Array) -> tuple[Sums, Array]:
-        """The sums after a random walk, and (...) which share of them is left.
+    def after_walk(self, variance: Array, overconfidence: Array) -> Sums:
+        """The sums after a random walk.
 
         Args:
             variance: (..., 6) of the walk.
@@ -165,13 +165,12 @@ class Sums:
         gain = np.linalg.inv(np.eye(_POSE) + hessian * by[..., None, :])
         hessian, back = gain @ hessian, gain.swapaxes(-1, -2)
         hessian = (hessian + hessian.swapaxes(-1, -2)) / 2
-        kept = np.trace(gain, axis1=-2, axis2=-1) / _POSE
-        walked = (self * kept).change(
+        kept = np.asarray(np.trace(gain, axis1=-2, axis2=-1) / _POSE)
+        return (self * kept).change(
             hessian=hessian,
             gradient=(gain @ self.gradient[..., None])[..., 0],
             scatter=gain @ self.scatter @ back + hessian * variance[..., None, :] @ hessian,
         )
-        return walked, kept
 
     @property
     def are_determined(self) -> Mask:

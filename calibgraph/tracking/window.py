@@ -15,8 +15,9 @@ import gtsam
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.graph.latent_poses import LatentPoseModel
-from calibgraph.graph.variables import CLOUD, DISTORTION, aligned_key, camera_key, matched_key
+from calibgraph.graph.latent_poses import LatentPoseModel, to_ordering
+from calibgraph.graph.variables import CLOUD, DISTORTION, camera_key, matched_key
+from calibgraph.model.config import Reported
 from calibgraph.model.geometry import adjoints, to_T_lidar_camera
 
 _RELINEARIZE = 0.1  # rad and m: beyond all that an epoch may move
@@ -43,8 +44,8 @@ class Window:
             self._start.insert(key, pose)
         for camera, pose in enumerate(self._poses):
             shared.insert(camera_key(camera), pose)
-            if camera in model.aligned:
-                shared.insert(aligned_key(camera), pose)
+        distortion = [DISTORTION] if model.is_distorted else []
+        self._mount_keys = [*model.camera_keys, *distortion]
         if model.is_distorted:
             shared.insert(DISTORTION, np.zeros(model.components.distortion_jacobian.shape[2]))
         shared.insert(self._start)
@@ -102,9 +103,11 @@ class Window:
         pairs = zip(self._poses, poses, strict=True)
         return np.array([reference.localCoordinates(pose) for reference, pose in pairs])
 
-    def T_camera_lidar(self, keys: Sequence[int]) -> Array:
-        """(n, 4, 4) of some estimates."""
-        return np.array([self.values.atPose3(key).inverse().matrix() for key in keys])
+    def reported(self, of: Reported) -> tuple[Array, Array]:
+        """(n, 4, 4) T_camera_lidar of mounts or alignments; (6 n, 6 n) their marginal."""
+        T, rows = self.model.reported(self.values, of)
+        rows = rows[:, self.model.columns_of(self._mount_keys)]
+        return T, rows @ self.covariance(self._mount_keys) @ rows.T
 
     def covariance(self, keys: Sequence[int]) -> Array:
         """Joint marginal of some variables, in their tangents."""
@@ -123,21 +126,7 @@ class Window:
 
     def undetermined(self) -> float:
         """Degrees of freedom of the shared errors that the data leave open."""
-        parts, cameras = self.model.components, len(self._poses)
-        seen = aligned_key if self.model.is_distorted else camera_key
-        keys = [*self._keys, *map(seen, range(cameras))]
-        own = self.covariance(keys)
-        found = float(np.trace(np.linalg.solve(parts.cloud, own[:_POSE, :_POSE])))
-        half = own[_POSE:, _POSE:].reshape(2, cameras, _POSE, 2, cameras, _POSE)
-        for camera in range(cameras):
-            both = half[:, camera, :, :, camera]
-            apart = both[0, :, 0] + both[1, :, 1] - both[0, :, 1] - both[1, :, 0]
-            found += float(np.trace(np.linalg.solve(parts.camera, apart)))
-        if self.model.is_distorted:
-            distortion = gtsam.NonlinearFactorGraph()
-            for factor in map(self.model.error_graph.at, range(self.model.error_graph.size())):
-                if [*factor.keys()] == [DISTORTION]:
-                    distortion.add(factor)
-            known = distortion.linearize(self.values).hessian(gtsam.Ordering([DISTORTION]))[0]
-            found += float(np.trace(known @ self.covariance([DISTORTION])))
-        return found
+        errors = self.model.error_graph
+        keys = [*errors.keyVector()]
+        known = errors.linearize(self.values).hessian(to_ordering(keys))[0]
+        return float((known * self.covariance(keys)).sum())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -20,16 +20,15 @@ from calibgraph.model.verdict import TOLERANCE, Check
 from calibgraph.solver.error_model import Conflict
 from calibgraph.solver.matches import CameraBlock
 from calibgraph.solver.solution import Solution
-from calibgraph.trust.observability import prior_shares
 from calibgraph.trust.pose_posterior import (
-    ImagePosteriors,
     MeasurePosteriors,
     PosePosterior,
     group_tied,
     measure_posteriors,
     measured_pairs,
-    no_posteriors,
+    widen,
 )
+from calibgraph.trust.probability import probability_beyond
 
 Checks = Mapping[str, Sequence[Check]]
 """Per camera, its checks; a camera without any may be left out."""
@@ -77,20 +76,14 @@ class Evidence:
         guess: the rig as it was first guessed.
         excluded: cameras that the user excluded; the solution may have excluded more.
         tied: the free cameras, in groups that can only be elsewhere together.
-        bars: the error bar of the matches beside the posteriors by the images; None where the
-            matches determine none.
-        joint_covariance: (6 N, 6 N) of both, the wider one; cameras that are held are unknown by a
-            radian and a metre.
-        prior_shares: per camera, which share of its result comes from priors and relative poses.
+        posteriors: per free camera whose images were scored, that of its pose by these.
     """
 
     solution: Solution
     guess: Rig
     excluded: tuple[str, ...]
     tied: Sequence[tuple[str, ...]]
-    bars: ImagePosteriors | None
-    joint_covariance: Array | None
-    prior_shares: dict[str, float]
+    posteriors: Mapping[str, PosePosterior]
 
     @property
     def cameras(self) -> tuple[str, ...]:
@@ -108,10 +101,16 @@ class Evidence:
         objective = self.solution.objective
         return objective.blocks if objective.uses_correspondences else {}
 
-    @property
-    def posteriors(self) -> Mapping[str, PosePosterior]:
-        """Per free camera, its posterior by the images' evidence."""
-        return {} if self.bars is None else self.bars.posteriors
+    @cached_property
+    def joint_covariance(self) -> Array | None:
+        """(6 N, 6 N) by matches and images, the wider one; cameras that are held are unknown."""
+        known = self.solution.covariance
+        return None if known is None else self._widen(known)
+
+    def _widen(self, joint: Array) -> Array:
+        """(6 N, 6 N): a covariance, widened where the images' evidence is flat."""
+        found = self.posteriors.items()
+        return widen(joint, {self.cameras.index(name): of.moments for name, of in found})
 
     @property
     def error_sources(self) -> dict[str, ErrorSources]:
@@ -121,9 +120,11 @@ class Evidence:
 
     def probability_beyond(self, camera: str) -> float:
         """The probability that its error is beyond the tolerance, by its posterior."""
-        if camera in self.solution.held or self.bars is None:
-            return 0.0
-        return self.bars.probability_beyond(camera, self.solution.config.tolerance)
+        own, found = self.covariance_by_matches(camera), self.posteriors.get(camera)
+        tolerance = self.solution.config.tolerance
+        if own is None or found is None:
+            return probability_beyond(own, tolerance)
+        return found.probability_beyond(own, tolerance)
 
     def covariance_of(self, camera: str) -> Array | None:
         """(6, 6) of one camera, with the error that all the matcher's frames share."""
@@ -131,7 +132,7 @@ class Evidence:
 
     def covariance_by_matches(self, camera: str) -> Array | None:
         """(6, 6) of one camera, not widened by what the images leave open."""
-        return self._rows_of(None if self.bars is None else self.bars.by_matches, camera)
+        return self._rows_of(self.solution.covariance, camera)
 
     def _rows_of(self, joint: Array | None, camera: str) -> Array | None:
         if joint is None or camera in self.solution.held:
@@ -142,17 +143,17 @@ class Evidence:
     def pair_covariances(self) -> dict[str, Array]:
         """Per pair "A->B", (6, 6): by second moments of the mounts about the solution, widened."""
         mount, T = self.solution.mount, self.solution.T_camera_lidar
-        if mount is None or self.bars is None:
+        if mount is None:
             return {}
         away = np.concatenate([twist_between(mount.T_camera_lidar[name], T[name]) for name in T])
-        joint = self.bars.widen(mount.covariance + np.outer(away, away))
+        joint = self._widen(mount.covariance + np.outer(away, away))
         return pair_covariances(joint, T, self.solution.held)
 
 
 def gather(
     solution: Solution,
     guess: Rig,
-    measure: MeasurePosteriors = no_posteriors,
+    measure: MeasurePosteriors | None = None,
     *,
     excluded: tuple[str, ...] = (),
 ) -> Evidence:
@@ -161,18 +162,16 @@ def gather(
     Args:
         solution: of a table.
         guess: the rig as it was first guessed.
-        measure: gives the posteriors by the images.
+        measure: gives the posteriors by the images; None: there are no images.
         excluded: cameras that the user excluded.
     """
     cameras = tuple(solution.T_camera_lidar)
     tied, known = _tied(solution), solution.covariance
-    bars, joint = None, None
-    if known is not None:
-        rows = {name: pose_rows(number) for number, name in enumerate(cameras)}
-        own = {name: known[rows[name], rows[name]] for group in tied for name in group}
-        bars = ImagePosteriors(cameras, known, measure(own, tied))
-        joint = bars.widen(known)
-    return Evidence(solution, guess, excluded, tied, bars, joint, prior_shares(solution))
+    if known is None or measure is None:
+        return Evidence(solution, guess, excluded, tied, {})
+    rows = {name: pose_rows(number) for number, name in enumerate(cameras)}
+    own = {name: known[rows[name], rows[name]] for group in tied for name in group}
+    return Evidence(solution, guess, excluded, tied, measure(own, tied))
 
 
 def _tied(solution: Solution) -> list[tuple[str, ...]]:
@@ -191,7 +190,7 @@ def gather_of_run(run: MatchingRun, *, asks_guess: bool = False) -> Evidence:
 
     ``asks_guess``: whether the guess is a pose in question, as in ``check``.
     """
-    measure: MeasurePosteriors = no_posteriors
+    measure: MeasurePosteriors | None = None
     if run.matcher.image_checks_can_fail and not run.out_of_time:
         asked = run.guess.T_camera_lidar if asks_guess else None
         rig, seed = run.solution.solved_rig, run.solution.config.seed

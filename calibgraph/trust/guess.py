@@ -1,4 +1,4 @@
-"""Checks of the initial guess: convention errors, swapped cameras, units, the matcher's range."""
+"""Checks of the initial guess: convention errors, another frame, swapped cameras, units."""
 
 from __future__ import annotations
 
@@ -7,15 +7,12 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from calibgraph.arrays import Array
-from calibgraph.matching.run import MatchingRun
 from calibgraph.model.geometry import (
     angle_deg,
     invert,
     pose_difference,
-    relative_transform,
     transform,
 )
 from calibgraph.model.verdict import Check
@@ -35,18 +32,22 @@ def guess_checks(evidence: Evidence) -> Checks:
         math.sqrt(3) * (reach or 0.0)
         for reach in (findings.range_rotation_deg, findings.range_translation_m)
     )
-    row = replace(row, warn=max(row.warn, range_m))
-    for name, result in evidence.solution.T_camera_lidar.items():
-        guess = evidence.guess.T_camera_lidar[name]
+    row, guesses = replace(row, warn=max(row.warn, range_m)), evidence.guess.T_camera_lidar
+    results = evidence.solution.T_camera_lidar
+    found = {name: T for name, T in results.items() if name not in findings.missed}
+    frame = describe_other_frame(guesses, found)
+    for name, result in results.items():
+        guess = guesses[name]
         degrees = angle_deg(guess[:3, :3] @ result[:3, :3].T)
         metres = float(np.linalg.norm(guess[:3, 3] - result[:3, 3]))
         is_turned = degrees > max(limit("guess_rotation"), range_deg)
         is_far = is_turned or row.grade(metres) != "PASS"
         error = convention_error_between({"": guess}, {"": result}) if is_far else None
-        advice = "" if error is None else f"it seems that {in_words(error)}"
+        words = "" if error is None else f"it seems that {in_words(error)}"
+        advice = "; or ".join(filter(None, (words, frame)))
         check = row.check(metres, advice=advice)
         if error is not None and check.status == "PASS":
-            text = f"{check.text} and {degrees:.3g} deg: {advice}"
+            text = f"{check.text} and {degrees:.3g} deg: {words}"
             check = replace(check, status="WARN", text=text)
         checks[name] = [check]
     return checks
@@ -136,28 +137,3 @@ def describe_other_frame(guess: Mapping[str, Array], results: Mapping[str, Array
         f"which the LiDAR is at x {x:.2f}, y {y:.2f}, z {z:.2f} m: multiply its T_camera_lidar by "
         "this pose from the right"
     )
-
-
-def range_checks(run: MatchingRun) -> Checks:
-    """Whether a result lies within the matcher's range around the guess, where that is known.
-
-    By the largest component of the step from a guess to its result.
-    """
-    findings, guess = run.correspondences.findings, run.guess.T_camera_lidar
-    results, checks = run.solution.T_camera_lidar, dict[str, list[Check]]()
-    frame = describe_other_frame(
-        guess, {name: T for name, T in results.items() if name not in findings.missed}
-    )
-    for name, T in results.items():
-        step = relative_transform(T, guess[name])
-        rotation_deg = np.degrees(Rotation.from_matrix(step[:3, :3]).as_rotvec())
-        components = (
-            (threshold("range_rotation"), rotation_deg, findings.range_rotation_deg),
-            (threshold("range_translation"), step[:3, 3], findings.range_translation_m),
-        )
-        checks[name] = [
-            row.check(float(np.abs(three).max() / max(largest, 1e-9)), advice=frame)
-            for row, three, largest in components
-            if largest is not None
-        ]
-    return checks

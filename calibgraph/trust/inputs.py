@@ -99,7 +99,7 @@ def find_doubts(rig: Rig, frame: Frame, cloud: Cloud) -> Iterator[str]:
             f"and {moved:.2g} m apart: clouds joined with a wrong extrinsic, or before their "
             "motion was corrected?"
         )
-    if frame.is_corrected and scan_duration_s(frame.cloud_path) == 0:
+    if frame.find_motion and scan_duration_s(frame.cloud_path) == 0:
         yield (
             f"all points of the cloud of frame {frame.name} have the same time, so that --motion "
             "moves it as a whole: record the times of points, or leave --motion out if the driver "

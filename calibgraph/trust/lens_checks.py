@@ -173,11 +173,9 @@ def intrinsics_checks(evidence: Evidence) -> Checks:
     """Whether wrong intrinsics explain the residuals.
 
     By all matches, not only those within the gate. The variance of what the frames of a place share
-    is taken for at least that of a small share of each match. Of a panorama the format determines
-    the lens.
+    is taken for at least that of a small share of each match.
     """
-    cameras = evidence.solution.without_pairs().solved_rig.cameras
-    names = [n for n in evidence.fitted_blocks if cameras[n].model != "equirectangular"]
+    names = [*evidence.fitted_blocks]
     checks = map_on_cores(lambda name: _check_camera(evidence, name), names)
     return dict(zip(names, checks, strict=True))
 

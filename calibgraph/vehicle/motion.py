@@ -82,7 +82,7 @@ class Drive:
     def __init__(self, frames: Sequence[Frame], poses: Path | None) -> None:
         self.frames, self._trajectory, self._steps = frames, _trajectory(poses), ScanSteps()
         of_bag = any(frame.cloud_path.suffix == MESSAGE_SUFFIX for frame in frames)
-        self._registers = not of_bag or all(frame.is_corrected for frame in frames)
+        self._registers = not of_bag or all(frame.find_motion is not None for frame in frames)
 
     def instant(self, number: int, lidars: Sequence[str]) -> Instant:
         """The clouds of a frame, and how the base moved."""
@@ -157,7 +157,7 @@ class Drive:
 
     def _pose(self, frame: Frame) -> Array | None:
         """(4, 4) T_world_base, if poses are given."""
-        if self._trajectory is None or frame.is_corrected or frame.stamp_ns is None:
+        if self._trajectory is None or frame.find_motion is not None or frame.stamp_ns is None:
             return frame.T_world_lidar
         return self._trajectory.at((frame.stamp_ns - self._trajectory.start_ns) / 1e9)
 

@@ -58,7 +58,7 @@ def test_the_lidar_is_told_from_all_cameras() -> None:
     lidar = found.lidar[-1]
     assert lidar is not None
     np.testing.assert_allclose(
-        np.degrees(lidar.motion[:3]), [0, 0, 1], atol=4 * np.degrees(lidar.sigma[:3].max())
+        np.degrees(lidar.deviation[:3]), [0, 0, 1], atol=4 * np.degrees(lidar.sigma[:3].max())
     )
 
 
@@ -79,14 +79,6 @@ def test_a_camera_that_looks_back_is_named_though_its_twist_has_two_signs() -> N
     for place in range(3):
         found = calibgraph.drift(results(4, 3, **{f"r{place}": {"left": twist("pitch", 180.0)}}))
         assert found.changed == ((str(place), "left"),)
-
-
-def test_a_result_that_is_much_sharper_than_the_others_is_compared_with_them() -> None:
-    rng = np.random.default_rng(5)
-    given = [draw(rng, {"left": twist("yaw", 1.0)}, wider=1e-7), *(draw(rng) for _ in range(4))]
-    found = calibgraph.drift(given)
-    assert found.changed == (("result 1", "left"),)
-    assert abs(np.degrees(found.cameras["left"][0].deviation[1]) - 1.0) < 0.1
 
 
 def test_two_against_two_is_no_majority() -> None:

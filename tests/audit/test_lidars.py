@@ -1,5 +1,6 @@
 """LiDARs in `check` and `drift`: the one that moved is named, the base too, others are not."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,7 +13,6 @@ import calibgraph
 from calibgraph.arrays import Array
 from calibgraph.audit import lidars as audit_of_lidars
 from calibgraph.audit.lidars import measure_lidars
-from calibgraph.audit.result import audit_summary
 from calibgraph.errors import CalibrationError, RigError
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.config import Config
@@ -128,9 +128,9 @@ def test_check_measures_lidars_in_a_recording(tmp_path: Path, call: Call):
     rig = deployed.rig.model_copy(update={"lidars": T})
     path = replace(deployed, rig=rig).save(tmp_path / "deployed")
     page = tmp_path / "page.html"
-    code, _, err = call("check", path, folder, "--tolerance-deg", 0.4, "--tolerance-cm", 5,
-                        "--out", page)  # fmt: skip
-    assert code == 1 and "WRONG left: " in err and "turned about z by -1.0" in err, err
+    code, out, err = call("check", path, folder, "--tolerance-deg", 0.4, "--tolerance-cm", 5,
+                          "--out", page, "--json")  # fmt: skip
+    assert code == 1, err
+    left = json.loads(out)["lidars"]["left"]
+    assert left["status"] == "WRONG" and "turned about z by -1.0" in left["reason"]
     assert "left is not where the calibration has it" in page.read_text()
-    audit = calibgraph.check(rig, folder)
-    assert audit_summary(audit)["lidars"]["left"]["status"] == "WRONG"

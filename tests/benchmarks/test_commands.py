@@ -6,9 +6,6 @@ import os
 import subprocess
 import sys
 
-import pytest
-
-from benchmarks import tables
 from benchmarks.speed import gate
 from tests.conftest import ROOT
 
@@ -35,20 +32,6 @@ def test_the_readme_lists_every_benchmark_and_tool() -> None:
     text = (ROOT / "benchmarks" / "README.md").read_text()
     for name in COMMANDS:
         assert f"| `{name.removeprefix('benchmarks.').removesuffix('.__main__')}` |" in text
-
-
-def test_tables_are_markdown_below_the_command_that_made_them(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(sys, "argv", ["solve.py", "--frames", "10"])
-    rows = (("ours", "0.1"), ("theirs", "12.0"))
-    tables.publish([tables.Table("Times", ("solver", "time [s]"), rows)])
-    text = capsys.readouterr().out
-    assert "--frames 10`, " in text and tables.commit() in text
-    assert text.endswith(
-        "Times:\n\n| solver | time [s] |\n| ---    |      --- |\n"
-        "| ours   |      0.1 |\n| theirs |     12.0 |\n"
-    )
 
 
 def test_the_gate_names_what_became_slower_than_the_release() -> None:

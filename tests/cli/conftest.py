@@ -9,11 +9,6 @@ from calibgraph import MatcherErrors, Rig, perturb, simulate_correspondences
 from tests.conftest import make_pair
 
 
-@pytest.fixture(autouse=True)
-def _blank_diagrams(blank_diagrams: None) -> None:
-    """Commands write reports; tests/report looks at their diagrams."""
-
-
 def save_problem(folder: Path) -> Path:
     """A folder with a rig, its truth, and a table of correspondences."""
     pair = make_pair()

@@ -75,25 +75,6 @@ def test_a_prior_from_the_same_data_is_warned_of(solved: CommandRun, call: Call)
         assert any(note in text for text in load_calibration(out).warnings) == warned
 
 
-def test_solve_estimates_a_lens_and_its_files_have_it(solved: CommandRun, call: Call) -> None:
-    problem = solved.folder.parent
-    out = problem / "with_lens"
-    code, _, text = call(
-        "solve", problem / "rig.yaml", problem / "table.parquet", "--out", out,
-        "--estimate", "focal",
-    )  # fmt: skip
-    assert code == 0
-    assert "focal px" in text
-    result = load_calibration(out)
-    for name, (focal,) in result.lens.items():
-        k = result.rig.cameras[name].intrinsics_px
-        assert focal.value == pytest.approx(np.sqrt(k.fx * k.fy), rel=1e-9)
-        assert focal.value != focal.prior
-    assert {*result.lens} == {"left", "right"}
-    assert "Lens and clock of left" in (out / "report.html").read_text()
-    assert load_calibration(solved.folder).lens == {}
-
-
 def test_the_result_file_is_complete_and_returns_the_result(solved: CommandRun) -> None:
     out = solved.folder
     content = yaml.safe_load((out / "calibration.yaml").read_text())
@@ -182,13 +163,6 @@ def test_names_are_printed_as_they_are(tmp_path: Path, call: Call) -> None:
     assert code == 0
     assert "[red]" in stderr
     assert "[bold]b" in stderr
-
-
-def test_a_rig_of_one_camera_is_solved(tmp_path: Path, call: Call) -> None:
-    rig = Rig(cameras={"only": make_camera()})
-    assert call(*words_to_solve(tmp_path, rig, frames=6))[0] == 0
-    code, stdout, _ = call("evaluate", tmp_path / "out", tmp_path / "rig.yaml", "--json")
-    assert json.loads(stdout)["pairs"] == {}
 
 
 def test_match_writes_a_table(call: Call, tmp_path: Path) -> None:

@@ -95,21 +95,6 @@ def test_the_recording_that_made_the_result_is_named(
 
 
 @pytest.mark.usefixtures("measured_once")
-def test_a_result_that_was_doubtful_is_said_to_have_been(
-    call: Call, calibrated_sample: CommandRun, tmp_path: Path
-) -> None:
-    said, deployed = (
-        "This result was WARN when it was made, and its report says why.",
-        tmp_path / "calibration.yaml",
-    )
-    text = (calibrated_sample.folder / "calibration.yaml").read_text()
-    given = (deployed, SAMPLE, "--frames", "0")
-    for status in ("WARN", "PASS"):
-        deployed.write_text(text.replace("status: PASS", f"status: {status}"))
-        assert (said in call("check", *given)[2]) == (status == "WARN")
-
-
-@pytest.mark.usefixtures("measured_once")
 def test_the_page_shows_the_answer(call: Call, tmp_path: Path) -> None:
     page = tmp_path / "check.html"
     code, _, err = call("check", REFERENCE, SAMPLE, "--frames", "0", "--out", page)

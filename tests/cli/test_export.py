@@ -8,7 +8,6 @@ import numpy as np
 import yaml
 
 from calibgraph import load_rig
-from calibgraph.io.formats import EXPORT_FORMATS
 from tests.conftest import SAMPLE, Call
 from tests.io.formats.readers import READERS
 
@@ -20,12 +19,6 @@ def test_a_rig_is_exported_and_the_file_named(call: Call, tmp_path: Path) -> Non
     truth = load_rig(SAMPLE).T_camera_lidar
     for name, T in READERS["urdf"](out).items():
         np.testing.assert_allclose(T, truth[name], atol=1e-9)
-
-
-def test_the_formats_are_listed_without_other_arguments(call: Call) -> None:
-    code, stdout, err = call("export", "--format", "list")
-    assert (code, err) == (0, "")
-    assert [line.split()[0] for line in stdout.splitlines()] == list(EXPORT_FORMATS)
 
 
 def test_options_of_export_reach_the_file(call: Call, tmp_path: Path) -> None:

@@ -44,7 +44,6 @@ def test_failed_jobs_exit_1(call: Call, tmp_path: Path, monkeypatch: pytest.Monk
     ("text", "options", "message"),
     [
         ("vehicle\na\n", [], "column 'recording' is missing"),
-        ("vehicle,recording\na,b;\n", [], "row 0: recording 'b;': expected"),
         ("vehicle,recording\na,.\n", ["--dask", "nonsense://x"], "--dask nonsense://x: no sched"),
         ("vehicle,recording\na,.\n", ["--dask", "tcp://x:1", "--jobs", "2"], "--jobs is of this"),
     ],
@@ -57,9 +56,3 @@ def test_wrong_input_is_one_line_and_writes_nothing(
     result = call("fleet", str(tmp_path / "fleet.csv"), "--out", str(out), *options)
     assert message in error_line(*result)
     assert not out.exists()
-
-
-def test_a_place_that_is_a_file_is_refused(call: Call, tmp_path: Path) -> None:
-    (tmp_path / "fleet.csv").write_text("vehicle,recording\na,.\n")
-    out = str(tmp_path / "fleet.csv")
-    assert "is a file" in error_line(*call("fleet", out, "--out", out))

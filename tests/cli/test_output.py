@@ -51,12 +51,6 @@ def test_json_that_cannot_be_printed_is_one_line(
     assert stderr.count("\n") == 1
 
 
-def test_a_list_that_cannot_be_printed_is_one_line() -> None:
-    code, stderr = run_in_shell("export --format list > /dev/full")
-    assert code == 2
-    assert stderr.startswith("calibgraph: standard output") and stderr.count("\n") == 1
-
-
 def test_an_argument_that_is_not_utf8_is_one_line() -> None:
     code, stderr = run_in_shell("evaluate $'\\xff.yaml' rig.yaml")
     assert code == 2

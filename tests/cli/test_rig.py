@@ -11,7 +11,6 @@ import pytest
 import yaml
 
 from calibgraph import load_rig, write_rig_template
-from calibgraph.guessing.mounting import parse_mounting
 from tests.cli.conftest import error_line
 from tests.conftest import SAMPLE, Call
 from tests.io.bags.writing import (
@@ -23,8 +22,6 @@ from tests.io.bags.writing import (
     write_bag,
 )
 from tests.io.formats.calibration_files import CAMERA_INFO, KALIBR, KOIDE, SENTENCE, URDF, write
-
-LENS = {"fx": 500.0, "fy": 500.0, "cx": 319.5, "cy": 179.5}
 
 
 @pytest.fixture
@@ -46,50 +43,13 @@ def test_the_file_has_the_cameras_and_image_sizes_of_the_folder(
     assert {(c["width_px"], c["height_px"]) for c in cameras.values()} == {(640, 360)}
 
 
-@pytest.mark.parametrize("command", ["calibrate", "match", "track"])
+@pytest.mark.parametrize("command", ["calibrate", "match"])
 def test_an_unfilled_file_is_refused_with_the_key_that_is_left(
     recording: Path, call: Call, command: str
 ) -> None:
     write_rig_template(recording)
-    rig = [recording / "rig.yaml"] if command == "track" else []
-    line = error_line(*call(command, *rig, recording, "--out", recording.parent / "out.parquet"))
+    line = error_line(*call(command, recording, "--out", recording.parent / "out.parquet"))
     assert "cameras.front_left.intrinsics_px.fx is still FILL_IN, and 17 more keys" in line
-
-
-def test_doctor_names_the_key_that_is_left(recording: Path, call: Call) -> None:
-    fill(write_rig_template(recording), leave="T_camera_lidar")
-    code, _, err = call("doctor", recording)
-    assert code == 1
-    assert "cameras.front_left.T_camera_lidar is still FILL_IN, and 2 more keys" in err
-
-
-def test_a_filled_file_is_a_rig_with_the_guess_of_the_words(recording: Path) -> None:
-    words = {name: "front-left, 0.4 m ahead" for name in ("front_left", "front_right", "left")}
-    path = write_rig_template(recording, mountings=words)
-    fill(path, leave="")
-    rig = load_rig(recording)
-    assert rig.cameras["left"].matrix_px[0, 0] == LENS["fx"]
-    wanted = parse_mounting("front-left, 0.4 m ahead", "left").T_camera_lidar()
-    np.testing.assert_allclose(rig.T_camera_lidar["left"], wanted, atol=1e-6)  # as rounded
-
-
-def test_matrices_in_the_comments_are_those_of_the_words(recording: Path) -> None:
-    text = write_rig_template(recording).read_text()
-    for words in ("front", "left", "right", "rear"):
-        (line,) = (line for line in text.splitlines() if f"{words} " in line and "[[" in line)
-        shown = yaml.safe_load(line[line.index("[[") :])
-        wanted = parse_mounting(words, words).T_camera_lidar()
-        np.testing.assert_allclose(shown, wanted, atol=1e-12)
-
-
-def fill(path: Path, leave: str) -> None:
-    """Fill in what a user would, but for a key."""
-    content = yaml.safe_load(path.read_text())
-    for camera in content["cameras"].values():
-        camera |= {"intrinsics_px": LENS, "distortion": []}
-        if leave != "T_camera_lidar" and camera["T_camera_lidar"] == "FILL_IN":
-            camera["T_camera_lidar"] = np.eye(4).tolist()
-    path.write_text(yaml.safe_dump(content))
 
 
 def test_a_file_that_is_there_is_replaced_only_with_force(recording: Path, call: Call) -> None:
@@ -119,39 +79,6 @@ def test_a_lens_in_words_is_computed_with_what_is_uncertain_of_it(
         assert sigma is not None and sigma.centre == 5.0
         assert sigma.focal == pytest.approx(0.02 * focal_px, abs=0.01)
         assert camera.distortion_sigma == 0.05
-
-
-def test_a_lens_of_one_camera_is_named_and_the_others_are_filled_in(
-    recording: Path, call: Call
-) -> None:
-    assert call("rig", recording, "--lens", "left=90 deg")[0] == 0
-    cameras = yaml.safe_load((recording / "rig.yaml").read_text())["cameras"]
-    assert {n for n, c in cameras.items() if c["intrinsics_px"]["fx"] == "FILL_IN"} == {
-        "front_left",
-        "front_right",
-    }
-
-
-def test_in_a_terminal_it_asks_for_the_lens_of_each_camera(
-    recording: Path, call: Call, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The answer of one camera is proposed for the next."""
-    asked, answers = [], iter(("90 deg", "90 deg", "calibration"))
-
-    def prompt(question: str, *, default: str, err: bool) -> str:
-        assert err
-        asked.append((question.partition(":")[0], default))
-        return next(answers)
-
-    monkeypatch.setattr("sys.stdin.isatty", lambda: True)
-    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
-    monkeypatch.setattr("typer.prompt", prompt)
-    assert call("rig", recording)[0] == 0
-    assert asked == [
-        ("front_left", "calibration"), ("front_right", "90 deg"), ("left", "90 deg")
-    ]  # fmt: skip
-    cameras = yaml.safe_load((recording / "rig.yaml").read_text())["cameras"]
-    assert [c["intrinsics_px"]["fx"] for c in cameras.values()] == [320.0, 320.0, "FILL_IN"]
 
 
 def test_a_bag_is_listed_and_its_rig_is_written(call: Call, tmp_path: Path) -> None:

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import io
 import logging
-import re
-from pathlib import Path
 
 import pytest
-from rich.console import Console
 from rich.table import Table
 
 from calibgraph.cli import terminal
@@ -24,19 +21,6 @@ def test_lines_of_progress_have_time_stage_and_steps_and_are_not_too_many() -> N
         progress("round 1 of 3: front", step, 1000)
     assert lines[0] == "    5 s  round 1 of 3: front, 100 of 1000"
     assert len(lines) == 9
-
-
-def test_a_terminal_shows_a_bar_with_the_time_that_is_left(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    screen = io.StringIO()
-    monkeypatch.setattr(
-        terminal, "terminal", lambda: Console(file=screen, force_terminal=True, width=100)
-    )
-    with terminal.progress_bar() as progress:
-        progress("round 1 of 3: front", 1, 4)
-    shown = re.sub(r"\x1b\[[\d;?]*[a-zA-Z]", "", screen.getvalue())
-    assert re.search(r"round 1 of 3: front.* 0:00:00 left -:--:--", shown)
 
 
 def test_names_of_others_do_nothing_to_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -57,8 +41,3 @@ def test_names_of_others_do_nothing_to_a_terminal(monkeypatch: pytest.MonkeyPatc
 def test_a_file_name_in_an_error_does_nothing_to_a_terminal(call: Call) -> None:
     code, _, err = call("evaluate", "no\x1b[2J\u202esuch", SAMPLE)
     assert code == 2 and err.strip().isprintable() and "no\\x1b[2J\\u202esuch" in err
-
-
-def test_short_work_prints_no_progress(call: Call, tmp_path: Path) -> None:
-    _, _, err = call("doctor", SAMPLE, "--frames", "0")
-    assert " of " not in "".join(line for line in err.splitlines() if " s  " in line)

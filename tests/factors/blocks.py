@@ -20,7 +20,6 @@ LENSES = {
     "rational": Lens.of("pinhole", **K, distortion=RADTAN8),
     "fisheye": Lens.of("fisheye", **K, distortion=KANNALA),
     "omnidirectional": Lens.of("omnidirectional", **K, distortion=(1.2, *RADTAN5[:4])),
-    "equirectangular": Lens.of("equirectangular", **K),
 }
 
 

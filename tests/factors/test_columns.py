@@ -25,7 +25,6 @@ from tests.factors.test_block import EACH_LENS_AND_SCALE, together
 
 KEY_CLOUD, KEY_LENS, FIRST_POINT = 6, 8, 100
 SIGMAS = {"focal": 0.002, "aspect": 0.001, "centre_x": 2.0, "centre_y": 3.0}
-FREE = [name for name in LENSES if name != "equirectangular"]
 TWIST = np.array([0.05, -0.03, 0.4, 9.0, 0.3, -0.1])
 HEIGHT_PX = 480
 
@@ -33,7 +32,7 @@ HEIGHT_PX = 480
 def free(name: str, *, clock: bool = False) -> Columns:
     """All parameters of a lens, and of its clock."""
     lens = LENSES[name]
-    sigmas = SIGMAS | dict.fromkeys(COEFFICIENT_NUMBERS[lens.kind], 0.01) if name in FREE else {}
+    sigmas = SIGMAS | dict.fromkeys(COEFFICIENT_NUMBERS[lens.kind], 0.01)
     if clock:
         sigmas = {"offset": 0.02, **sigmas, "readout": 0.02}
     return Columns(lens, tuple(sigmas), tuple(sigmas.values()), Clock(0.01, 0.005, HEIGHT_PX))
@@ -54,7 +53,7 @@ def with_lens(pose: gtsam.Pose3, values: np.ndarray) -> gtsam.Values:
 
 
 @pytest.mark.parametrize(
-    ("name", "clock"), [*((name, False) for name in FREE), *((name, True) for name in LENSES)]
+    ("name", "clock"), [(name, clock) for name in LENSES for clock in (False, True)]
 )
 def test_derivatives_are_those_of_differences(name: str, clock: bool) -> None:
     lens, rng = free(name, clock=clock), np.random.default_rng(1)
@@ -78,7 +77,7 @@ def test_derivatives_are_those_of_differences(name: str, clock: bool) -> None:
         np.testing.assert_allclose(columns[number], (up - down) / (2 * step), atol=limit)
 
 
-@pytest.mark.parametrize("name", FREE)
+@pytest.mark.parametrize("name", LENSES)
 def test_with_the_lens_held_it_is_the_block_factor(name: str) -> None:
     block, lens = world(LENSES[name], 60), free(name)
     graph = gtsam.NonlinearFactorGraph()
@@ -194,8 +193,6 @@ def moved_by(values: gtsam.Values, key: int, step: np.ndarray) -> gtsam.Values:
 def test_refuses_parameters_that_a_lens_does_not_have() -> None:
     with pytest.raises(ValueError, match="no free k4"):
         Columns(LENSES["radtan"], ("k4",), (1.0,))
-    with pytest.raises(ValueError, match="no free focal"):
-        Columns(LENSES["equirectangular"], ("focal",), (1.0,))
 
 
 def test_equals_factors_of_gtsam_on_a_camera_that_moves_on() -> None:

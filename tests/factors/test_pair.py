@@ -138,7 +138,7 @@ def surface_residual(lens_b: Lens, ray_a: Array, plane_per_m: Array, pixel_b_px:
         ]
         pixel, by_point = lens_b.project_with_jacobian(y)
         by_poses = np.hstack([*by_a, skew(y), -w * np.eye(3)])
-        return lens_b.subtract(pixel, pixel_b_px)[0], by_point[0] @ by_poses
+        return pixel[0] - pixel_b_px, by_point[0] @ by_poses
 
     return residual
 

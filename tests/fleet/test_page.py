@@ -99,13 +99,6 @@ def test_states_and_words_choose_vehicles(page: Path, rows: pa.Table, tmp_path: 
     assert re.search(r"moved in its mount by 0\.\d+ deg, \d", page.read_text())
 
 
-@pytest.mark.slow
-def test_the_page_of_ten_thousand_vehicles_is_small(tmp_path: Path) -> None:
-    page = page_of(simulate_fleet(np.random.default_rng(9), 10_000).rows, tmp_path)
-    assert page.stat().st_size < 2e6
-    assert 4000 < int(opened(page, "document.title = rows.length;", tmp_path)) < 6000
-
-
 def test_the_model_is_written_beside_the_page(page: Path) -> None:
     known = json.loads((page.parent / "fleet_model.json").read_text())
     (mount,) = {n: m for n, m in known["models"]["van"]["cameras"].items() if n == "left"}.values()

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import itertools
 import os
 import shutil
 import sys
-import threading
 from pathlib import Path
 
 import fsspec
@@ -21,7 +19,6 @@ from calibgraph.fleet.files import (
     Store,
     fetch,
     fingerprint,
-    in_arrow,
     join,
     read_bytes,
     read_rows,
@@ -63,26 +60,6 @@ def test_places_without_rows_are_one_line(tmp_path: Path) -> None:
         Store("")
     parquet.write_table(pa.table({"x": [1]}), tmp_path / "one.parquet")
     assert len(read_rows(str(tmp_path / "one.parquet"))) == 1
-
-
-def test_a_reader_finds_whole_rows_while_they_are_replaced(tmp_path: Path) -> None:
-    publish(str(tmp_path), "a")
-    stop = threading.Event()
-
-    def replace() -> None:
-        for length in itertools.cycle((1, 2000)):
-            if stop.is_set():
-                return
-            publish(str(tmp_path), "a", note="x" * length)
-
-    writer = threading.Thread(target=replace)
-    writer.start()
-    try:
-        lengths = [len(read_rows(str(tmp_path))) for _ in range(200)]
-    finally:
-        stop.set()
-        writer.join()
-    assert lengths == [1] * 200
 
 
 @pytest.fixture
@@ -148,15 +125,6 @@ def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "fleet.csv")
     with pytest.raises(FileError, match="is no file that can be read"):
         read_bytes(str(tmp_path / "fleet.csv"), 1000)
-
-
-def test_what_arrow_reads_is_none_of_pythons() -> None:
-    """Its threads would need the interpreter to drop it, which may have ended by then."""
-    content = os.urandom(100)
-    before = sys.getrefcount(content)
-    reader = in_arrow(content)
-    assert sys.getrefcount(content) == before
-    assert (reader.read(), in_arrow(b"").read()) == (content, b"")
 
 
 def test_without_fsspec_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -29,14 +29,13 @@ def test_a_file_returns_the_same_table(suffix: str, tmp_path: Path) -> None:
     given = table(
         information_px=[[1, 0, 1], [2, 0.5, 1], [1, 1, 1], [4, 0, 0]],
         stamp_ns=[1, 2, 2, 1_700_000_000_123_456_789],
-        point_index=[7, -1, 0, 2**40],
         metadata={"matcher": "by hand", "settings": {"k": 1}},
     )
     path = tmp_path / f"table{suffix}"
     given.save(path)
     read = load_correspondences(path)
     assert [read.cameras[i] for i in read.camera_index] == ["left", "left", "right", "left"]
-    for name in ("frame", "pixels_px", "points_lidar_m", "confidence", "stamp_ns", "point_index"):
+    for name in ("frame", "pixels_px", "points_lidar_m", "confidence", "stamp_ns"):
         np.testing.assert_array_equal(getattr(read, name), getattr(given, name))
     np.testing.assert_array_equal(read.information_px, given.information_px)
     if suffix == ".parquet":
@@ -45,11 +44,11 @@ def test_a_file_returns_the_same_table(suffix: str, tmp_path: Path) -> None:
 
 
 def test_a_table_written_by_another_tool_is_read(tmp_path: Path) -> None:
-    """Plain strings, float32, no confidence, no metadata, columns in another order."""
+    """Plain strings, float32, no confidence or metadata, other order, a column of older tables."""
     columns = {
         "x_m": np.float32([1.5, 2]), "y_m": np.float32([0, 1]), "z_m": np.float32([0, 1]),
         "u_px": np.float32([5, 6]), "v_px": np.float32([7, 8]),
-        "frame": [3, 4], "camera": ["a", "b"],
+        "frame": [3, 4], "camera": ["a", "b"], "point_index": [7, -1],
     }  # fmt: skip
     path = tmp_path / "table.parquet"
     parquet.write_table(pa.table(columns), path)
@@ -136,15 +135,6 @@ def test_a_file_that_is_not_there_or_not_whole_is_named(
         load(tmp_path / ("x" * 300 + ".parquet"))
 
 
-def test_a_whole_number_is_a_systematic_error_as_well(tmp_path: Path) -> None:
-    said = {"systematic_rotation_rad": 1, "systematic_translation_m": 0.02}
-    table(metadata=said).save(tmp_path / "table.parquet")
-    assert load_correspondences(tmp_path / "table.parquet").findings.systematic_sigmas == (
-        1.0,
-        0.02,
-    )
-
-
 def changed(name: str, column: pa.Array | pa.ChunkedArray, **metadata: str | bytes) -> pa.Table:
     """A good Arrow table with one column, or its metadata, replaced."""
     arrow = GOOD.set_column(GOOD.column_names.index(name), name, column)
@@ -169,10 +159,6 @@ CAMERAS = pa.array([0, 1, 0, 2])
             changed("camera", pa.DictionaryArray.from_arrays(CAMERAS, ["a", None, "b"])),
             "row 1: column 'camera' is empty",
         ),
-        (
-            changed("camera", pa.DictionaryArray.from_arrays(CAMERAS, FOUR)),
-            "'camera' must hold text, found dictionary<values=double",
-        ),
         (changed("camera", pa.array([b"\xff"] * 4)), "has the wrong type: Invalid UTF8"),
         (changed("frame", pa.array([2**63] * 4, pa.uint64())), "'frame' .* beyond 64 bits"),
         (changed("frame", pa.array(FOUR)), "'frame' must hold whole numbers, found double"),
@@ -181,13 +167,6 @@ CAMERAS = pa.array([0, 1, 0, 2])
             changed("u_px", pa.RunEndEncodedArray.from_arrays([4], [1.0])),
             "'u_px' must hold numbers, found run_end_encoded",
         ),
-        (changed("u_px", pa.array([FOUR] * 4)), "'u_px' must hold numbers, found list"),
-        (
-            changed("u_px", pa.array(FOUR).dictionary_encode()),
-            "'u_px' must hold numbers, found dictionary",
-        ),
-        (changed("u_px", pa.array([1] * 4, pa.decimal128(3, 1))), "found decimal"),
-        (changed("u_px", pa.array([1] * 4, pa.timestamp("s"))), "found timestamp"),
         (
             changed("u_px", pa.array(FOUR), matcher='{"systematic_rotation_rad": -1}'),
             "systematic_rotation_rad: .* greater than or equal to 0, found -1",
@@ -210,7 +189,6 @@ def test_wrong_arrow_data_is_named_in_one_line(arrow: pa.Table, message: str) ->
         pa.array(["left", "left", "right", "left"]).dictionary_encode(),
         pa.array(["left", "left", "right", "left"], pa.large_string()),
         pa.array([b"left", b"left", b"right", b"left"]),
-        pa.chunked_array([pa.array(["left", "left"]), pa.array(["right", "left"])]),
         pa.DictionaryArray.from_arrays([0, 1, 3, 0], ["left", "left", None, "right"]),
     ],
 )

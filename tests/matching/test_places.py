@@ -19,7 +19,7 @@ from calibgraph.io.frame import Frame
 from calibgraph.io.rigs import load_rig
 from calibgraph.matching import places
 from calibgraph.matching.cloud_similarity import Z_UP, UprightCloud, align_with_any, find_up
-from calibgraph.matching.places import Motion, PlaceFinder, PlaceWalk, find_places, motions
+from calibgraph.matching.places import Motion, PlaceWalk, find_places, motions
 from calibgraph.model.geometry import invert, transform
 from tests.conftest import SAMPLE, make_camera
 
@@ -215,51 +215,6 @@ def test_the_places_do_not_depend_on_the_axes_of_the_clouds(
     assert find_places(other, data.rig.moved_to(T), name) == expected
 
 
-def test_frame_by_frame_the_places_are_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The first camera's motion if there is one, else the next camera's."""
-    data, name = sample()
-    steps = [driving(15.0), None, None, driving(15.0), driving(1.0)]
-    asked: list[tuple[int, int]] = []
-
-    def motion(both: tuple[tuple[Frame, object], ...], **_: object) -> Motion:
-        (before, _), (now, _) = both
-        asked.append((before.index, now.index))
-        return steps[before.index]
-
-    monkeypatch.setattr(places, "align_with_any", aligned_with_none)
-    monkeypatch.setattr(places, "_motion", motion)
-    monkeypatch.setattr(places, "_detect", lambda *_: None)
-    finder = PlaceFinder(data.rig)
-    found = [finder.first_of_place(frame) for frame in data.frames[:6]]
-    monkeypatch.setattr(places, "motions", lambda *_, **__: steps)
-    monkeypatch.setattr(places, "LEAST_UPRIGHT", 10**6)  # after an unknown motion it stays, too
-    expected = find_places(replace(data, frames=data.frames[:6]), data.rig, name)
-    assert found == [place[0] for place in expected for _ in place] == [0, 0, 0, 0, 4, 4]
-    cameras = len(data.rig.cameras)
-    assert asked.count((0, 1)) == 1 and asked.count((1, 2)) == cameras
-
-
-@pytest.mark.parametrize(
-    ("names", "places_found"),
-    [
-        (("000000", "000001"), [0, 0]),
-        (("000000", "000185"), [0, 1]),
-        ((f"{10**15}", f"{10**15 + 10**6}"), [0, 0]),
-        ((f"{10**15}", f"{10**15 + 20 * 10**6}"), [0, 1]),
-        (("here", "there"), [0, 0]),
-    ],
-)
-def test_a_frame_stays_after_an_unknown_motion_if_it_follows_closely(
-    names: tuple[str, str], places_found: list[int], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """By stamps, or else by numbers: unlike clouds of frames far apart are of other places."""
-    monkeypatch.setattr(places, "align_with_any", aligned_with_none)
-    data, _ = sample()
-    frames = [replace(f, name=name) for f, name in zip(data.frames, names, strict=False)]
-    walk = PlaceWalk(in_sequence=True)
-    assert [walk.first_of_place(frame, None) for frame in frames] == places_found
-
-
 # Places that were visited before
 
 
@@ -297,15 +252,6 @@ def test_two_recordings_of_a_street_have_the_same_places(tmp_path: Path) -> None
     rig = Rig(cameras={"front": make_camera()})
     data = Dataset(rig=rig, frames=(*once, *again), folders=(tmp_path,))
     assert find_places(data, rig, "front") == [[0, 1, 2, 4, 5, 6], [3, 7]]
-
-
-def test_a_remembered_place_is_recognised(tmp_path: Path) -> None:
-    poses = [STOPS[0], STOPS[5], STOPS[1]]
-    frames = scanned(tmp_path, poses)
-    walk = PlaceWalk()
-    for frame in frames[:2]:
-        walk.remember(frame)
-    assert walked(walk, frames[2:]) == [0]
 
 
 @pytest.mark.realdata

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import io
 from collections.abc import Callable
 from dataclasses import replace
@@ -44,7 +43,6 @@ def extreme() -> Calibration:
         covariance=dict.fromkeys(NAMES, COVARIANCE),
         residuals=dict.fromkeys(NAMES, Residuals(12345.678, 1.0, 1.0, 1.0, 1.0)),
         counts=dict.fromkeys(NAMES, {"used": 12_345_678, "frames_used": 100_000}),
-        prior_share=dict.fromkeys(NAMES, 1.0),
         lens=dict.fromkeys(NAMES, (lens,)),
     )
 
@@ -128,13 +126,3 @@ def test_names_fold_and_words_and_numbers_are_whole_on_80_columns(
     assert numbers
     for cell in numbers:
         assert any(set(cell.split()) <= set(row) for row in rows), cell
-
-
-def test_every_table_of_the_command_line_is_among_them() -> None:
-    made = {
-        name
-        for module in (tables, audit_tables)
-        for name, function in inspect.getmembers(module, inspect.isfunction)
-        if function.__annotations__.get("return") in ("Table", Table)
-    }
-    assert made - {"make_table"} == set(TABLES)

@@ -15,7 +15,6 @@ import pytest
 from starlette.testclient import TestClient
 
 from calibgraph.service.app import create_app
-from calibgraph.service.request_guard import TokenScope, add_token
 from calibgraph.service.requests import Settings
 from tests.cli.conftest import save_problem
 
@@ -76,11 +75,6 @@ def solved(working: TestClient, small: Problem) -> str:
 
 def bearer(token: str) -> dict[str, str]:
     return {"Authorization": f"Bearer {token}"}
-
-
-def make_tokens(path: Path, *scopes: TokenScope) -> list[dict[str, str]]:
-    """Headers with new tokens."""
-    return [bearer(add_token(path, scope)) for scope in scopes]
 
 
 def service_folder(client: TestClient) -> Path:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import sqlite3
-import time
 from pathlib import Path
 from typing import Any
 
@@ -71,31 +70,6 @@ def test_a_database_that_fails_later_is_503_and_heals(
         }
     assert statuses == {503}
     assert client.get(f"/v1/jobs/{id}").json()["state"] == "queued"
-
-
-@pytest.mark.parametrize("jump_s", [-10 * 86400.0, 10 * 86400.0])
-def test_a_clock_that_jumps_loses_no_waiting_job(
-    make_server: Make, small: Problem, monkeypatch: pytest.MonkeyPatch, jump_s: float
-) -> None:
-    client = make_server(keep_s=86400.0)
-    id = client.post("/v1/jobs/solve", files=small.files).json()["id"]
-    app: Any = client.app
-    jumped = time.time() + jump_s
-    monkeypatch.setattr(time, "time", lambda: jumped)
-    later = client.post("/v1/jobs/solve", files=small.files).json()["id"]
-    app.state.service.runner.remove_expired()
-    assert [job["id"] for job in client.get("/v1/jobs").json()["jobs"]] == [later, id]
-    assert app.state.service.jobs.start_next().id == id  # the order is that of submission
-
-
-def test_a_job_whose_process_is_killed_is_run_again(working: TestClient, small: Problem) -> None:
-    app: Any = working.app
-    app.state.service.runner._slots[0].child.kill()
-    answer = working.post(
-        "/v1/jobs/solve", files=small.files, data={"settings": '{"report": false}'}
-    )
-    at = answer.headers["location"]
-    assert working.get(at, params={"wait_s": 60}).json()["state"] == "succeeded"
 
 
 def test_two_servers_do_not_share_a_folder(tmp_path: Path) -> None:

@@ -20,11 +20,11 @@ pytestmark = in_chromium
 def served(tmp_path_factory: pytest.TempPathFactory, small: Problem) -> Iterator[tuple[str, str]]:
     """A server with jobs of all states, and a token of it."""
     folder = tmp_path_factory.mktemp("page")
-    token = add_token(folder / "tokens", "submit")
+    token = add_token(folder / "tokens")
     server = Server(folder / "data", "--tokens", str(folder / "tokens"))
     server.start()
     server.http.headers.update(bearer(token))
-    about = {"name": "car 7 <b>", "note": "after the repair of the left camera's bracket " * 5}
+    about = {"name": "car 7 <b>"}
     wrong = {**small.files, "rig": b"cameras: 7"}
     for files, data in ((small.files, about), (wrong, {}), (small.files, {})):
         at = server.http.post("/v1/jobs/solve", files=files, data=data).headers["location"]

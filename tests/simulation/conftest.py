@@ -18,9 +18,8 @@ LENSES: dict[str, tuple[float, ...]] = {
     "radtan": RADTAN5,
     "fisheye": KANNALA,
     "omnidirectional": (1.3, *RADTAN5[:4]),
-    "equirectangular": (),
 }
-FOCAL_PX = {"pinhole": 150.0, "radtan": 150.0, "omnidirectional": 140.0, "equirectangular": 38.2}
+FOCAL_PX = {"pinhole": 150.0, "radtan": 150.0, "omnidirectional": 140.0}
 DRIVE_SEED = 3
 
 

@@ -11,7 +11,7 @@ import pytest
 from calibgraph import CalibrationError, Rig, load_dataset, load_rig
 from calibgraph.model.geometry import angle_deg, relative_transform
 from calibgraph.simulation.lidar import scan
-from calibgraph.simulation.recording import Drive, build_drive, simulate_street
+from calibgraph.simulation.recording import build_drive, simulate_street
 from tests.simulation.conftest import SCAN
 from tools.scenes.surroundings import SURROUNDINGS
 
@@ -89,16 +89,3 @@ def test_missing_open3d_says_how_to_install_it(
     monkeypatch.setitem(sys.modules, "open3d", None)
     with pytest.raises(CalibrationError, match=r"pip install 'calibgraph\[simulation\]'"):
         simulate_street(tmp_path / "out", rig, frames=1)
-
-
-def test_nothing_is_left_of_a_recording_that_fails(
-    rig: Rig, drive: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fails(*arguments: object, **options: object) -> None:
-        raise MemoryError
-
-    monkeypatch.setattr("calibgraph.simulation.recording.build_drive", lambda **_: drive)
-    monkeypatch.setattr("calibgraph.simulation.recording.render", fails)
-    with pytest.raises(MemoryError):
-        simulate_street(tmp_path / "out", rig, frames=1, beams=16)
-    assert not list((tmp_path / "out").iterdir())

@@ -6,9 +6,15 @@ import gtsam
 import numpy as np
 
 from calibgraph.graph.latent_poses import LatentPoseModel
-from calibgraph.graph.variables import cloud_at_key, matched_at_key
+from calibgraph.graph.variables import (
+    DISTORTION,
+    aligned_key,
+    camera_key,
+    cloud_at_key,
+    matched_at_key,
+)
 from calibgraph.model.geometry import to_T_camera_lidar, to_T_lidar_camera
-from calibgraph.solver.places import Linearization
+from calibgraph.solver.places import ErrorFit, Linearization
 
 
 def all_values(linear: Linearization) -> gtsam.Values:
@@ -19,7 +25,19 @@ def all_values(linear: Linearization) -> gtsam.Values:
     for place, number in linear.model.matched_places:
         T = cameras[linear.model.matched.index(number)][place]
         values.insert(matched_at_key(place, number), to_T_lidar_camera(T))
+    for number, jacobian in enumerate(linear.model.alignment):
+        if linear.model.is_distorted:
+            mount = values.atPose3(camera_key(number))
+            values.insert(
+                aligned_key(number), mount.retract(jacobian @ values.atVector(DISTORTION))
+            )
     return values
+
+
+def reported_keys(fit: ErrorFit) -> list[int]:
+    """Keys of the poses that are reported."""
+    is_mount = fit.is_of_mount or fit.model.of == "mount" or not fit.model.is_distorted
+    return [*map(camera_key if is_mount else aligned_key, range(len(fit.model.cameras)))]
 
 
 def linearized(model: LatentPoseModel, values: gtsam.Values) -> Linearization:
@@ -29,7 +47,7 @@ def linearized(model: LatentPoseModel, values: gtsam.Values) -> Linearization:
     keys += [[matched_at_key(place, number) for place in places] for number in model.matched]
     poses = [[values.atPose3(k) if values.exists(k) else none for k in row] for row in keys]
     shared = gtsam.Values(values)
-    for key in place_keys(model):
+    for key in {*values.keys()} - {*model.shared_keys}:
         shared.erase(key)
     inverses = np.array([[to_T_camera_lidar(pose) for pose in row] for row in poses])
     return Linearization(model, shared, inverses)

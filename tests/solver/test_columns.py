@@ -62,7 +62,7 @@ def test_the_shift_is_how_a_solve_of_the_bent_cloud_differs(mixed_rig: Rig, bend
 @pytest.mark.parametrize("bend", [0, 1, 2])
 def test_a_camera_that_sees_all_round_shows_the_bends(bend: int) -> None:
     """By what no pose can follow: within three standard deviations, which are far below it."""
-    rig, size = rig_of("panorama"), np.array([2e-3, 2e-2, 0.05])[bend]
+    rig, size = rig_of("omni"), np.array([2e-3, 2e-2, 0.05])[bend]
     errors = MatcherErrors(noise_px=0.5, outlier_share=0.0)
     table = simulate_correspondences(rig, frames=4, matches=400, errors=errors, seed=0)
     points = table.points_lidar_m
@@ -84,7 +84,7 @@ def test_a_camera_that_sees_all_round_shows_the_bends(bend: int) -> None:
 
 def test_what_the_cameras_show_of_the_bends_moves_them_back() -> None:
     """Motion of 0.1 m, of a table that states 0.15 m and nothing else."""
-    rig = rig_of("panorama")
+    rig = rig_of("omni")
     table = simulate_correspondences(rig, frames=6, matches=400, seed=0)
     points = table.points_lidar_m
     stated = {**table.metadata, "scan_motion_m": 0.15}

@@ -45,7 +45,7 @@ from calibgraph.trust.evidence import Evidence, gather
 from factors import pose_sigmas
 from tests.draws.lenses import with_known_lenses
 from tests.draws.places import displaced
-from tests.solver.latent import all_values, place_keys
+from tests.solver.latent import all_values, place_keys, reported_keys
 from tests.solver.test_camera_pairs import simulated_pairs
 
 ZERO = {"systematic_rotation_rad": 0.0, "systematic_translation_m": 0.0}
@@ -180,8 +180,8 @@ def of_matches(errors: ErrorFit) -> np.ndarray:
         robust_scale=np.inf,
     )
     model = replace(errors.model, components=parts)
-    others = [key for key in model.shared_keys if key not in model.reported_keys]
-    order = to_ordering([*model.reported_keys, *others, *place_keys(model)])
+    reported = reported_keys(errors)
+    order = to_ordering([*reported, *model.shared_keys, *place_keys(model)])
     starts, end = {}, 0
     for number in range(order.size()):
         starts[order.at(number)] = end

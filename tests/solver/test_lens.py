@@ -18,7 +18,7 @@ from calibgraph import (
 )
 from calibgraph.graph.latent_poses import latent_pose_graph
 from calibgraph.graph.lens import LensVariable
-from calibgraph.graph.variables import body_key, lens_key
+from calibgraph.graph.variables import lens_key
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import twist_between
 from calibgraph.model.rig import IntrinsicsSigma
@@ -27,7 +27,7 @@ from calibgraph.solver.joint import solve_joint
 from calibgraph.solver.lens import lens_estimates
 from calibgraph.solver.solution import Solution
 from tests.draws.lenses import put_lens_error, with_known_lenses
-from tests.solver.latent import all_values
+from tests.solver.latent import all_values, reported_keys
 from tests.solver.test_places import STATED, minimize
 
 ERRORS = MatcherErrors(noise_px=1.0, frame_noise_px=1.0, outlier_share=0.15)
@@ -157,8 +157,9 @@ def test_the_covariance_of_a_mount_is_that_of_its_graph(drawn: Drawn) -> None:
     fit = found.error_fit
     marginals = gtsam.Marginals(found.graph(), all_values(fit.linear))
     for number in range(len(truth.cameras)):
-        own = found.covariance[6 * number : 6 * number + 6, 6 * number : 6 * number + 6]
-        sigmas = np.sqrt(np.diag(marginals.marginalCovariance(body_key(number))))
+        rows = slice(6 * number, 6 * number + 6)
+        own = marginals.marginalCovariance(reported_keys(fit)[number]) + fit.by_lenses[rows, rows]
+        sigmas = np.sqrt(np.diag(found.covariance[rows, rows]))
         np.testing.assert_allclose(np.sqrt(np.diag(own)), sigmas, rtol=1e-3)
 
 
@@ -173,7 +174,7 @@ def test_estimate_and_sigma_are_those_of_the_whole_graph(drawn: Drawn) -> None:
     assert 2 * graph.error(all_values(fit.linear)) == pytest.approx(fit.cost, rel=1e-9)
     assert 2 * graph.error(values) == pytest.approx(fit.cost, rel=1e-5)  # its tolerance is 1e-6
     marginals = gtsam.Marginals(graph, values)
-    for number, (name, estimates) in enumerate(lens_estimates(fit).items()):
+    for number, (name, estimates) in enumerate(lens_estimates(fit)[0].items()):
         own, lens = (
             marginals.marginalCovariance(lens_key(number)),
             values.atVector(lens_key(number)),
@@ -182,8 +183,8 @@ def test_estimate_and_sigma_are_those_of_the_whole_graph(drawn: Drawn) -> None:
         relative = [one.sigma / one.prior_sigma for one in estimates]
         np.testing.assert_allclose(relative, sigmas, rtol=0.01)
         assert np.abs((fit.linear.shared.atVector(lens_key(number)) - lens) / sigmas).max() < 0.02
-        pose = marginals.marginalCovariance(body_key(number))
         rows = slice(6 * number, 6 * number + 6)
+        pose = marginals.marginalCovariance(reported_keys(fit)[number]) + fit.by_lenses[rows, rows]
         np.testing.assert_allclose(
             np.sqrt(np.diag(fit.covariance[rows, rows])), np.sqrt(np.diag(pose)), rtol=0.01
         )

@@ -35,7 +35,6 @@ to_arrow = Correspondences.to_arrow
 
 COLUMNS = (
     "frame", "pixels_px", "points_lidar_m", "confidence", "information_px", "stamp_ns",
-    "point_index",
 )  # fmt: skip
 
 
@@ -57,8 +56,7 @@ def shuffled(rig: Rig, seed: int) -> Correspondences:
         points_lidar_m=points[rows],
         confidence=rng.integers(1, 6, n) / 5,
         information_px=np.column_stack([root[:, 0], np.zeros(n), root[:, 1]]),
-        stamp_ns=rng.integers(0, 2**60, n),
-        point_index=np.arange(n),
+        stamp_ns=np.arange(n),
         metadata={"matcher": "simulated", "systematic_rotation_rad": 0.001},
     )
 
@@ -104,7 +102,7 @@ def test_preprocessing_keeps_what_is_kept_by_hand(mixed_rig: Rig) -> None:
     by_camera, counts = by_hand(mixed_rig, table, config)
     for name, rows in by_camera.items():
         order = sorted(rows, key=lambda row: (table.frame[row], row))
-        assert kept.table.of_camera(name).point_index.tolist() == order
+        assert kept.table.of_camera(name).stamp_ns.tolist() == order
         assert counts[name].items() <= kept.counts[name].items()
 
 

@@ -165,7 +165,7 @@ def test_a_second_signal_ends_it_at_once_and_loses_nothing(
         with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
             patch.setattr(command, "print_line", write)
             patch.setattr(sys, "stdin", SimpleNamespace(buffer=lines))
-            track(world.guess, [Path("-")], config=Config(), out=tmp_path, notify=print)
+            track(world.guess, "-", config=Config(), out=tmp_path, notify=print)
     finally:
         signal.signal(signal.SIGINT, before)
     _, out, _ = piped(world.rig, as_lines(world.tables), "--out", tmp_path)
@@ -240,17 +240,6 @@ def test_a_motion_of_no_vehicle_ends_it_in_one_line(
         assert not text and not out[1].exists() and err.count("\n") == 1
         assert f"{path}: row {row} (camera 'left', frame 1): " in err
     assert code == 2 and RULE in err
-
-
-@pytest.mark.parametrize("option", [("--interval-s", 0.1), ("--motion", "scans"), ("--step", 2)])
-def test_options_for_clouds_are_refused_without_a_matcher(
-    world: World, call: Call, tmp_path: Path, option: tuple[object, ...]
-) -> None:
-    out = tmp_path / "out"
-    code, text, err = call("track", world.rig, world.source, "--out", out, *option)
-    assert (code, text) == (2, "")
-    assert f"{option[0]} goes with --matcher only" in err and err.count("\n") == 1
-    assert not out.exists()
 
 
 def test_a_lens_or_clock_is_refused_while_driving(world: World, call: Call, tmp_path: Path) -> None:

@@ -83,7 +83,7 @@ def test_a_table_gives_its_frames_in_ascending_order(suffix: str, tmp_path: Path
 
 
 def test_a_json_line_is_a_frame() -> None:
-    left = camera(2, confidence=[0.5, 1], point_index=[3, -1], u_px=[1, 2])
+    left = camera(2, confidence=[0.5, 1], u_px=[1, 2])
     right = camera(1, i_uu_px=[2], i_uv_px=[0.5], i_vv_px=[1])
     (item,) = of_bytes(
         line(cameras={"right": right, "left": left}, stamp_ns=2**62, metadata={"matcher": "m"})
@@ -95,10 +95,8 @@ def test_a_json_line_is_a_frame() -> None:
     left_rows, right_rows = item.table.of_camera("left"), item.table.of_camera("right")
     assert left_rows.pixels_px.tolist() == [[1, 1.5], [2, 1.5]]
     assert left_rows.confidence.tolist() == [0.5, 1]
-    assert left_rows.point_index.tolist() == [3, -1]
     assert left_rows.information_px.tolist() == [[1, 0, 1]] * 2
     assert right_rows.information_px.tolist() == [[2, 0.5, 1]]
-    assert right_rows.point_index.tolist() == [-1]
     assert right_rows.confidence.tolist() == [1]
 
 
@@ -127,7 +125,6 @@ def test_a_frame_without_rows_is_a_frame(cameras: dict[str, Any]) -> None:
         (line(cameras={"left": camera(u_px=[10**400])}), "u_px.0: Input should be a valid number"),
         (line().replace(b"[1.5]", b"[1e999]"), "camera 'left': pixel must be finite"),
         (line(cameras={"left": camera(u_px=[1, 2])}), "differ in length: {'u_px': 2, 'v_px': 1"),
-        (line(cameras={"left": camera(point_index=[2**63])}), "point_index.0: Input should be"),
         (line(cameras={"left": camera(i_uu_px=[1])}), "has only ['i_uu_px'] of"),
     ],
 )
@@ -189,7 +186,7 @@ def test_a_source_that_is_none_is_refused_at_once(tmp_path: Path) -> None:
         "missing.parquet: no such file": lambda: frames_of(tmp_path / "missing.parquet"),
         "cannot be read": lambda: frames_of("x" * 300),
         "is no file that can be read": lambda: frames_of(tmp_path / "pipe"),
-        "is no table of correspondences; to track a dataset": lambda: frames_of(tmp_path),
+        "is no table of correspondences; match its frames": lambda: frames_of(tmp_path),
     }
     for message, call in calls.items():
         with pytest.raises(FileError, match=message):

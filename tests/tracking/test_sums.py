@@ -96,7 +96,7 @@ def test_the_walk_adds_exactly_its_variance_to_the_covariance() -> None:
     )
     walks = Sums.stack([epoch] * len(STRENGTHS))
     variance = np.linspace(0.1, 0.6, 6)
-    after, _ = walks.after_walk(np.outer(STRENGTHS**2, variance), np.full(len(STRENGTHS), 3.0))
+    after = walks.after_walk(np.outer(STRENGTHS**2, variance), np.full(len(STRENGTHS), 3.0))
     for walk, strength in enumerate(STRENGTHS):
         expected = inverse_sandwich(epoch) + strength**2 * np.diag(variance)
         np.testing.assert_allclose(inverse_sandwich(after[walk]), expected, rtol=1e-9)

@@ -15,14 +15,14 @@ from calibgraph.io.frame import Frame
 from calibgraph.model.places import Places
 from calibgraph.solver.columns import apply_twist
 from calibgraph.trust import image_evidence
-from calibgraph.trust.image_checks import evidence_checks
-from calibgraph.trust.image_evidence import WIDE, FrameScorer, ImageEvidence, measure_lens
+from calibgraph.trust.image_evidence import WIDE, ImageEvidence, evidence_checks, measure_lens
 from calibgraph.trust.lens_parameter import (
     NAMES,
     Free,
     LensParameter,
     lens_variable,
 )
+from calibgraph.trust.pose_posterior import FrameScorer
 from tests.conftest import SAMPLE
 
 NAME = "front_left"

@@ -109,7 +109,7 @@ def test_error_bars_of_runs_state_more_than_held_and_a_sure_one_is_sure() -> Non
 
 
 def test_a_wide_error_bar_and_few_frames_are_no_signs_of_an_error_in_runs() -> None:
-    rows = {"sigma_translation": 60.0, "frames": 1.0, "prior_share": 0.9}
+    rows = {"sigma_translation": 60.0, "frames": 1.0}
     checks = [threshold(kind).check(value) for kind, value in rows.items()]
     assert {check.status for check in checks} > {"FAIL"}
     assert probability_of_checks(checks, STRUCTURE) == probability_of_checks([], STRUCTURE)

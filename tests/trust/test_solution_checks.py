@@ -29,7 +29,7 @@ from calibgraph.solver.joint import solve_joint
 from calibgraph.trust.agreement import check_competing_solution
 from calibgraph.trust.evidence import Checks
 from calibgraph.trust.matcher_checks import repeated_file_checks
-from calibgraph.trust.observability import weakest_direction
+from calibgraph.trust.solution_checks import weakest_direction
 from tests.conftest import SAMPLE
 from tests.trust.conftest import named, simulated
 
@@ -282,11 +282,3 @@ def test_empty_parts_of_image_and_depth_are_named(pair: Rig) -> None:
     assert "the left third of the image has no matches" in words
     assert "nothing nearer than 9" in words and "nothing farther than 14 m" in words
     assert "middle third" not in words and "hard to distinguish" in words
-
-
-def test_the_share_of_the_priors_is_their_influence(pair: Rig) -> None:
-    table = simulated(pair)
-    assert solve(pair, table, terms="reprojection").prior_share["left"] == 0
-    strong = solve(pair, table, Config(prior_weight=1e12))
-    assert strong.prior_share["left"] > 0.99
-    assert named(strong, "left", "share of the priors")[0].status == "WARN"

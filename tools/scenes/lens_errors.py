@@ -19,8 +19,7 @@ def draw_lens_errors(rig: Rig, size: float, rng: np.random.Generator) -> Rig:
     At size 1 as a good calibration with a target (40 views, corners to 0.2 px, leave a focal length
     0.1 to 0.2 % and a principal point 0.1 % of the width uncertain): focal lengths wrong by 0.1 %
     both, by 0.02 % one alone, principal points by 0.05 % of the image's width, and radial
-    distortion by 0.03 % of it at the corners (standard deviations). Equirectangular images have no
-    lens to be wrong.
+    distortion by 0.03 % of it at the corners (standard deviations).
 
     Returns:
         The rig with other lenses. Its extrinsics are those with which they project, over the whole

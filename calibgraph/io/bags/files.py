@@ -5,26 +5,19 @@ A recording has ``topics`` by name, and messages as bytes in the order in which 
 
 import bz2
 import sqlite3
-from bisect import bisect_left
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import ExitStack
 from copy import copy
 from functools import partial
-from heapq import heappop, heappush, merge
+from heapq import merge
 from io import BytesIO
-from itertools import accumulate, count
 from operator import itemgetter
 from pathlib import Path, PurePath
 from shlex import quote
-from struct import Struct
 from typing import Any
-from zlib import crc32
 
 import lz4.frame
-from mcap.data_stream import ReadDataStream
-from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
-from mcap.records import Chunk, ChunkIndex
 from rosbags.rosbag1 import Reader
 
 from calibgraph.errors import FileError
@@ -88,11 +81,7 @@ def unpack(path: Path, kind: str, data: Buffer) -> Buffer:
     elif kind == "bz2":
         content = bz2.BZ2Decompressor().decompress(data, most + 1)
     else:
-        raise FileError(
-            path,
-            f"is compressed by {kind!r}; known are bz2, lz4 and zstd: write it again with "
-            "`mcap compress` or `rosbag compress`",
-        )
+        raise _unknown_compression(path, kind)
     if len(content) > most:
         raise FileError(
             path,
@@ -102,8 +91,15 @@ def unpack(path: Path, kind: str, data: Buffer) -> Buffer:
     return content
 
 
-_MAGIC, _HEAD, _MESSAGE = b"\x89MCAP0\r\n", Struct("<BQ"), Struct("<HIQQ")
-_KNOWN = frozenset(map(int, Opcode))
+def _unknown_compression(path: Path, kind: str) -> FileError:
+    return FileError(
+        path,
+        f"is compressed by {kind!r}; known are bz2, lz4 and zstd: write it again with "
+        "`mcap compress` or `rosbag compress`",
+    )
+
+
+_MAGIC, _PACKINGS = b"\x89MCAP0\r\n", ("lz4", "zstd")
 _KINDS = {bz2.decompress: "bz2", lz4.frame.decompress: "lz4"}
 _TABLES = """
     SELECT count(*) FROM sqlite_master
@@ -168,7 +164,8 @@ class McapFile:
             raise
 
     def _read_index(self, size: int) -> None:
-        found = SeekingReader(self._file, record_size_limit=size).get_summary()
+        self._reader = SeekingReader(self._file, validate_crcs=True, record_size_limit=size)
+        found = self._reader.get_summary()
         if self._file.seek(-len(_MAGIC), 2) and self._file.read() != _MAGIC:
             raise ValueError("its end is missing")
         of = found and found.statistics
@@ -185,20 +182,15 @@ class McapFile:
                 "its index is not whole (chunks, channels and counts at the end); write one with "
                 f"`mcap recover {quote(str(self._path))} -o whole.mcap`, and give that file",
             )
-        chunks = sorted(found.chunk_indexes, key=lambda each: each.message_start_time)
-        if any(each.chunk_start_offset + each.chunk_length > size for each in chunks):
-            raise ValueError("its index names chunks behind its end")
-        content = sum(each.uncompressed_size for each in chunks)
+        for kind in {each.compression for each in found.chunk_indexes} - {"", "none", *_PACKINGS}:
+            raise _unknown_compression(self._path, kind)
+        content = sum(each.uncompressed_size for each in found.chunk_indexes)
         if content > max(_ALWAYS_WHOLE, _RATIO_WHOLE * size):
             raise FileError(
                 self._path,
                 f"its {size} bytes unpack to {content >> 20} MiB or more, which no recording does; "
                 "record it again",
             )
-        self._channels = {number: each.topic for number, each in found.channels.items()}
-        self._chunks = chunks
-        self._starts_ns = [each.message_start_time for each in chunks]
-        self._latest_ns = [*accumulate((each.message_end_time for each in chunks), max)]
         self.topics = topics_by_name(
             make_topic(
                 each.topic,
@@ -211,59 +203,9 @@ class McapFile:
 
     def messages(self, topics: Collection[str], start_ns: int, stop_ns: int) -> Recorded:
         """The messages of some topics, by time."""
-        chosen = {number: topic for number, topic in self._channels.items() if topic in topics}
-        waiting: list[tuple[int, int, str, bytes]] = []
-        number = count()
-        first = bisect_left(self._latest_ns, start_ns)
-        for chunk in self._chunks[first : bisect_left(self._starts_ns, stop_ns)]:
-            channels = chunk.message_index_offsets.keys()  # none if the file has no such index
-            if chunk.message_end_time < start_ns or (channels and channels.isdisjoint(chosen)):
-                continue
-            while waiting and waiting[0][0] < chunk.message_start_time:
-                time_ns, _, topic, data = heappop(waiting)
-                yield topic, time_ns, data
-            for opcode, body in _records(self._content(chunk)):
-                if opcode != Opcode.MESSAGE:
-                    continue
-                channel, _, time_ns, _ = _MESSAGE.unpack_from(body)
-                if channel in chosen and start_ns <= time_ns < stop_ns:
-                    message = bytes(body[_MESSAGE.size :])
-                    heappush(waiting, (time_ns, next(number), chosen[channel], message))
-        while waiting:
-            time_ns, _, topic, data = heappop(waiting)
-            yield topic, time_ns, data
-
-    def _content(self, index: ChunkIndex) -> bytes | memoryview:
-        self._file.seek(index.chunk_start_offset)
-        if _HEAD.unpack(self._file.read(_HEAD.size)) != (
-            Opcode.CHUNK, index.chunk_length - _HEAD.size
-        ):  # fmt: skip
-            raise ValueError("a chunk is not where its index states")
-        body = BytesIO(self._file.read(index.chunk_length - _HEAD.size))
-        chunk = Chunk.read(ReadDataStream(body))
-        content = unpack(self._path, chunk.compression, chunk.data)
-        if len(content) != index.uncompressed_size:
-            raise ValueError("a chunk is not as long as its index states")
-        if chunk.uncompressed_crc not in (0, crc32(content)):
-            raise ValueError("the checksum of a chunk is not that of its content")
-        return content
-
-
-def _records(data: bytes | memoryview) -> Iterator[tuple[int, memoryview]]:
-    """The kind and content of each record.
-
-    Raises:
-        ValueError: if a kind is unknown, or the last record incomplete.
-    """
-    view, end = memoryview(data), 0
-    while end < len(data):
-        opcode, length = _HEAD.unpack_from(data, end)
-        start, end = end + _HEAD.size, end + _HEAD.size + length
-        if opcode not in _KNOWN:
-            raise ValueError(f"a record of the unknown kind {opcode}")
-        if end > len(data):
-            raise ValueError("a record is incomplete")
-        yield opcode, view[start:end]
+        found = self._reader.iter_messages(topics, starting_at=start_ns, ending_before=stop_ns)
+        for _, channel, message in found:
+            yield channel.topic, message.log_time, message.data
 
 
 class _Ros1Reader(Reader):

@@ -54,22 +54,6 @@ def read_bag_rig(path: Path, options: BagOptions | None = None) -> RigParts:
     )
 
 
-def rig_of_bag(path: Path | str, options: BagOptions | None = None) -> Rig:
-    """The rig that a bag describes: lenses from CameraInfo, T_camera_lidar from /tf_static.
-
-    The frames are those that the messages name: the camera's optical frame (x right, y down, z
-    forward) in its CameraInfo, the LiDAR's in its clouds.
-
-    Args:
-        path: the bag.
-        options: which topics; those found by type if None.
-
-    Raises:
-        FileError, DatasetError: if the bag is damaged, or a topic, a lens or a transform missing.
-    """
-    return read_bag_rig(Path(path), options).to_rig()
-
-
 def doubtful_axes(rig: Rig) -> list[str]:
     """A line for each camera that looks straight up, as with body axes for optical ones."""
     return [

@@ -17,13 +17,14 @@ import cv2
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.errors import CalibrationError, FileError, in_words
+from calibgraph.errors import CalibrationError, FileError
 from calibgraph.files import read_yaml, require_new_file, write_text
 from calibgraph.io.calibrations import is_calibration, load_calibration
 from calibgraph.io.formats import EXPORT_FORMATS
 from calibgraph.io.formats.foreign_keys import DERIVED
+from calibgraph.io.formats.rig_import import read_autoware
 from calibgraph.io.kitti import CALIBRATION_NAME
-from calibgraph.io.rig_parts import Link, frame_id, pose_of_angles, quaternion_xyzw, roll_pitch_yaw
+from calibgraph.io.rig_parts import Link, frame_id, quaternion_xyzw, roll_pitch_yaw
 from calibgraph.io.rigs import load_rig, rig_file
 from calibgraph.model.calibration import FRAMES_SENTENCE, Calibration
 from calibgraph.model.geometry import (
@@ -174,23 +175,9 @@ def carried_coefficients(name: str, camera: Camera, most: int, what: str) -> lis
     return padded[:most]
 
 
-def no_place_for(name: str, camera: Camera, what: str) -> CalibrationError:
-    """The error of a format that has no place for a camera's lens model."""
-    return CalibrationError(
-        f"camera {name!r}: {what} cannot hold a lens of the model {camera.model}; choose another "
-        "--format (opencv, json), or undistort the images and calibrate these",
-        camera=name,
-    )
-
-
-def commented(lines: Iterable[str]) -> str:
-    """Lines as a comment of YAML and of shells."""
-    return "".join(f"# {line}\n" for line in lines)
-
-
 def commented_yaml(statement: Iterable[str], content: dict[str, Any]) -> str:
     """YAML below its statement of direction."""
-    return commented(statement) + yaml_text(content)
+    return "".join(f"# {line}\n" for line in statement) + yaml_text(content)
 
 
 def commented_xml(statement: Iterable[str], root: ElementTree.Element) -> str:
@@ -326,15 +313,9 @@ def read_kit(path: Path) -> dict[str, Array]:
     Raises:
         FileError: if it has none, or one is malformed.
     """
-    found = dict[str, Array]()
-    try:
-        for name, row in read_yaml(path)[_KIT].items():
-            values = [float(row[key]) for key in _ANGLES]
-            found[name] = pose_of_angles(values[:3], values[3:])
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise FileError(
-            path, f"is no {_KIT} with rows of {', '.join(_ANGLES)}: {in_words(error)}"
-        ) from None
+    links = read_autoware(read_yaml(path), path).links
+    if not (found := {each.child: each.T_parent_child for each in links if each.parent == _KIT}):
+        raise FileError(path, f"has no rows of {_KIT}; name the sensor_kit_calibration.yaml")
     return found
 
 
@@ -419,8 +400,6 @@ def _of_kalibr(export: RigExport, names: list[str], index: int) -> dict[str, Any
 def _projection(name: str, camera: Camera) -> dict[str, Any]:
     intrinsics = [*camera.intrinsics_px.model_dump().values()]
     model, distortion, coefficients = "pinhole", "radtan", [*camera.distortion]
-    if camera.model == "equirectangular":
-        raise no_place_for(name, camera, "Kalibr's camchain")
     if camera.model == "omnidirectional":
         model, intrinsics, coefficients = "omni", [coefficients[0], *intrinsics], coefficients[1:]
     elif camera.model == "fisheye":
@@ -462,9 +441,7 @@ def _of_ros(name: str, camera: Camera) -> dict[str, Any]:
     if camera.model == "pinhole":
         distortion += [0.0] * (_PLUMB_BOB - len(distortion))
     is_rational = camera.model == "pinhole" and len(distortion) > _PLUMB_BOB
-    model = "rational_polynomial" if is_rational else _MODELS.get(camera.model)
-    if model is None:
-        raise no_place_for(name, camera, "ROS's camera_info")
+    model = "rational_polynomial" if is_rational else _MODELS[camera.model]
     return {
         "image_width": camera.width_px,
         "image_height": camera.height_px,

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from pydantic import ConfigDict
@@ -28,9 +28,9 @@ from calibgraph.io.lenses import (
     stated_model,
     unified_coefficients,
 )
-from calibgraph.io.rig_parts import ONLY_CAMERA, RelativeCamera, RigParts, pose_of_quaternion
+from calibgraph.io.rig_parts import ONLY_CAMERA, RigParts, pose_of_quaternion, relative_pose
 from calibgraph.model.geometry import invert
-from calibgraph.model.rig import Intrinsics, Size, plain_key, rigid_transform
+from calibgraph.model.rig import Intrinsics, RelativePose, Size, plain_key, rigid_transform
 from calibgraph.yaml_text import describe_value, parse_yaml
 from factors import LensModel
 from factors.lens import COEFFICIENTS
@@ -43,41 +43,17 @@ _FISHEYE_COUNT = 4
 _ADD = "add the line `distortion_model: fisheye` or `distortion_model: plumb_bob` to the file"
 
 
-class _Transform(NamedTuple):
-    """One key of a (4, 4), or those of a rotation and a translation: p_end = T p_start."""
-
-    keys: list[str]
-    start: str
-    end: str
-
-
-class ForeignKeys(NamedTuple):
-    """The table of keys, plain; coefficients as they are written."""
-
-    lens: dict[str, list[str]]
-    groups: list[str]
-    above: list[str]
-    coefficients: dict[str, list[str]]
-    transforms: list[_Transform]
-    not_read: dict[str, str]
-
-
 @cache
-def foreign_keys() -> ForeignKeys:
-    """The table."""
+def foreign_keys() -> dict[str, Any]:
+    """The table, with the keys of lenses, groups, transforms and of what is not read in plain."""
     file = files(__package__) / "foreign_keys.yaml"
     table = parse_yaml(file.read_text("utf-8"), "foreign_keys.yaml")
-    return ForeignKeys(
-        lens={quantity: [*map(plain_key, keys)] for quantity, keys in table["lens"].items()},
-        groups=[*map(plain_key, table["groups"])],
-        above=table["above"],
-        coefficients=table["coefficients"],
-        transforms=[
-            _Transform([*map(plain_key, row["keys"])], row["from"], row["to"])
-            for row in table["transforms"]
-        ],
-        not_read={plain_key(row["key"]): row["why"] for row in table["not_read"]},
-    )
+    table["lens"] = {quantity: [*map(plain_key, keys)] for quantity, keys in table["lens"].items()}
+    table["groups"] = [*map(plain_key, table["groups"])]
+    for row in table["transforms"]:
+        row["keys"] = [*map(plain_key, row["keys"])]
+    table["not_read"] = {plain_key(row["key"]): row["why"] for row in table["not_read"]}
+    return table
 
 
 def read_foreign(content: dict[str, Any], path: Path, name: str | None) -> RigParts | None:
@@ -89,7 +65,7 @@ def read_foreign(content: dict[str, Any], path: Path, name: str | None) -> RigPa
     owner = (name or cameras[0].name or path.stem) if single else name or ONLY_CAMERA
     lenses: dict[str, CameraLens] = {}
     extrinsics: dict[str, Array] = {}
-    pairs: list[RelativeCamera] = []
+    pairs: list[RelativePose] = []
     notes: list[str] = []
     for each in maps:
         camera = owner if single or not each.holds_a_lens else each.name or path.stem
@@ -100,10 +76,10 @@ def read_foreign(content: dict[str, Any], path: Path, name: str | None) -> RigPa
             lenses[camera], note = each.lens()
             notes += [note] if note else []
         for row, T in each.transforms():
-            if row.start == "camera before":
-                pairs += [RelativeCamera(camera, before, T)] * bool(before)
+            if row["from"] == "camera before":
+                pairs += [relative_pose(camera, before, T)] * bool(before)
             else:
-                found = T if row.end == "camera" else invert(T)
+                found = T if row["to"] == "camera" else invert(T)
                 if np.abs(extrinsics.setdefault(camera, found) - found).max() > _SAME:
                     raise FileError(path, "two of its keys give different T_camera_lidar; keep one")
     if not extrinsics:
@@ -156,14 +132,16 @@ class _Map:
         self._where = ": ".join([str(path), *above])
         self._content = _flat(content)
         self._keys: dict[str, str] = {}
-        of_lens = {alias for aliases in foreign_keys().lens.values() for alias in aliases}
+        of_lens = {alias for aliases in foreign_keys()["lens"].values() for alias in aliases}
         for key, value in self._content.items():
             other = self._keys.setdefault(_plain(key), key)
             if _plain(key) in of_lens and value != self._content[other]:
                 raise FileError(self._where, f"{other} and {key} differ; give one camera per file")
         given = (self._content[self._keys[n]] for n in ("cameraname", "name") if n in self._keys)
         texts = [str(each) for each in given if isinstance(each, (str, int)) and each]
-        keys = [k for k in above if k not in foreign_keys().above and re.fullmatch(r"[\w.-]+", k)]
+        keys = [
+            k for k in above if k not in foreign_keys()["above"] and re.fullmatch(r"[\w.-]+", k)
+        ]
         self.name = "".join(texts[:1]).strip("/").replace("/", "_") or "".join(keys[-1:])
 
     @property
@@ -180,20 +158,25 @@ class _Map:
 
     def lens(self) -> tuple[CameraLens, str]:
         """The lens, and a note on what was assumed; empty if nothing was."""
+        window = self._content.get("roi")
+        binned = [self._content.get(key) not in (None, 0, 1) for key in ("binning_x", "binning_y")]
+        if any(binned) or (isinstance(window, dict) and any(window.values())):
+            raise FileError(self._where, "states binning or a window (roi), which only bags are "
+                            "read with: give the lens of the images as they are")  # fmt: skip
         model, coefficients, note = self._distortion(stated_model(self._content, self._where))
         shift = self._key("time_offset_s")
         offset_s = None if shift is None else self._number(shift)
         return CameraLens(model, self._size(), self._intrinsics(), coefficients, offset_s), note
 
-    def transforms(self) -> Iterator[tuple[_Transform, Array]]:
+    def transforms(self) -> Iterator[tuple[dict[str, Any], Array]]:
         """The rows of the table whose keys are here, with their (4, 4)."""
-        for row in foreign_keys().transforms:
-            if self._keys.keys() >= {*row.keys}:
-                yield row, self._transform([self._keys[key] for key in row.keys])
+        for row in foreign_keys()["transforms"]:
+            if self._keys.keys() >= {*row["keys"]}:
+                yield row, self._transform([self._keys[key] for key in row["keys"]])
 
     def left_out(self) -> Iterator[str]:
         """Notes on what is known and not read."""
-        for plain, why in foreign_keys().not_read.items():
+        for plain, why in foreign_keys()["not_read"].items():
             if plain in self._keys:
                 yield (
                     f"{self._where}: {self._keys[plain]} is not read: {why}; give T_camera_lidar, "
@@ -221,7 +204,7 @@ class _Map:
             raise FileError(where, str(error)) from error
 
     def _key(self, quantity: str) -> str | None:
-        aliases = foreign_keys().lens[quantity]
+        aliases = foreign_keys()["lens"][quantity]
         given = [self._keys[alias] for alias in aliases if alias in self._keys]
         for other in given[1:]:
             if self._content[other] != self._content[given[0]]:
@@ -305,7 +288,7 @@ class _Map:
         plain = {f"{part}{i}" for part in ("d", "camd") for i in range(8)} & self._keys.keys()
         if plain:
             return [self._number(self._keys[name]) for name in sorted(plain)]
-        names = foreign_keys().coefficients
+        names = foreign_keys()["coefficients"]
         from_k2 = model == "fisheye" and "k5" in self._keys and "k1" not in self._keys
         listed = names["camodocal" if from_k2 else model if model in names else "pinhole"]
         values = [self._number(self._keys[n]) if n in self._keys else 0.0 for n in listed]
@@ -360,4 +343,4 @@ def _flat(content: Mapping[str, Any]) -> dict[str, Any]:
 
 def _is_group(key: Any) -> bool:
     """Whether the keys below a key are of the lens around it."""
-    return _plain(str(key)) in foreign_keys().groups
+    return _plain(str(key)) in foreign_keys()["groups"]

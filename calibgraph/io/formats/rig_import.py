@@ -5,29 +5,26 @@ import shlex
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Annotated, Any, TypeVar
+from typing import Any, TypeVar
 from xml.etree import ElementTree
 
 import numpy as np
 from defusedxml import DefusedXmlException
 from defusedxml.ElementTree import fromstring
-from pydantic import AliasPath, ConfigDict, Field
+from pydantic import AliasPath, Field
 
 from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError, FileError
 from calibgraph.files import checked_model, read_json, read_text, require_file
 from calibgraph.io.bags import is_bag
-from calibgraph.io.bags.camera_info import lens_of
 from calibgraph.io.bags.rig import read_bag_rig
-from calibgraph.io.formats.foreign_keys import Foreign, read_foreign
+from calibgraph.io.formats.foreign_keys import Foreign, numbers, read_foreign
 from calibgraph.io.kitti import CALIBRATION_NAME
 from calibgraph.io.lenses import CameraLens
 from calibgraph.io.rig_parts import (
     ONLY_CAMERA,
     Link,
     Links,
-    RelativeCamera,
     RigParts,
     T_between,
     ancestors,
@@ -40,8 +37,8 @@ from calibgraph.io.rig_parts import (
 )
 from calibgraph.io.rigs import is_exported_rig, read_rig
 from calibgraph.model.geometry import T_OPTICAL_LINK
-from calibgraph.model.rig import KNOWLEDGE, Finite, Mount, Rig, Size
-from calibgraph.yaml_text import parse_yaml_documents
+from calibgraph.model.rig import KNOWLEDGE, Mount, Rig
+from calibgraph.yaml_text import describe_value, parse_yaml_documents
 
 _PUBLISHER = "static_transform_publisher"
 _NAMES = ("x", "y", "z", "qx", "qy", "qz", "qw")
@@ -118,11 +115,6 @@ class _Stamped(Foreign):
     qw: float = Field(validation_alias=AliasPath("transform", "rotation", "w"))
 
 
-def is_tf2(content: dict[str, Any]) -> bool:
-    """Whether the content of a YAML file is a TFMessage, or a single TransformStamped."""
-    return "transforms" in content or {"transform", "child_frame_id"} <= content.keys()
-
-
 def read_tf2(documents: list[dict[str, Any]], path: Path) -> RigParts:
     """The frames of TFMessages and TransformStampeds; the last of several for a child.
 
@@ -147,22 +139,6 @@ def read_tf2(documents: list[dict[str, Any]], path: Path) -> RigParts:
     return RigParts(path, links=tuple(links.values()), notes=tuple(notes))
 
 
-class _Pose(Foreign):
-    model_config = ConfigDict(extra="forbid")
-
-    x: Finite
-    y: Finite
-    z: Finite
-    roll: Finite
-    pitch: Finite
-    yaw: Finite
-
-
-def is_autoware(content: dict[str, Any]) -> bool:
-    """Whether the content of a YAML file is parent: {child: {x, y, z, roll, pitch, yaw}}."""
-    return any(isinstance(pose, dict) and "roll" in pose for _, _, pose in _entries(content))
-
-
 def _entries(content: dict[str, Any]) -> Iterator[tuple[str, str, Any]]:
     for parent, children in content.items():
         for child, pose in children.items() if isinstance(children, dict) else ():
@@ -173,9 +149,13 @@ def read_autoware(content: dict[str, Any], path: Path) -> RigParts:
     """The frames of a sensor kit."""
     links = []
     for parent, child, pose in _entries(content):
-        p = checked_model(_Pose, pose, f"{path}: {parent}: {child}")
+        where = f"{path}: {parent}: {child}"
+        if not isinstance(pose, dict) or pose.keys() != {*_ANGLES}:
+            keys = ", ".join(_ANGLES)
+            raise FileError(where, f"expected the keys {keys}, found {describe_value(pose)}")
         try:
-            T = pose_of_angles((p.x, p.y, p.z), (p.roll, p.pitch, p.yaw))
+            values = [numbers(pose[key], f"{where}: {key}").item() for key in _ANGLES]
+            T = pose_of_angles(values[:3], values[3:])
         except ValueError as error:
             raise FileError(path, f"{parent}: {child}: {error}") from error
         links.append(Link(parent, child, T))
@@ -263,8 +243,11 @@ def read_part(path: Path, name: str | None) -> RigParts:  # noqa: PLR0911 - a li
         return _read_xml(path)
     if suffix in (".sh", ".bash"):
         return read_publishers(read_text(path).splitlines(), path)
-    if suffix in (".yaml", ".yml", ".json"):
-        return _read_content(_read_documents(path), path, name)
+    if suffix == ".json":
+        return _read_content([read_json(path)], path, name)
+    if suffix in (".yaml", ".yml"):  # several documents are what `ros2 topic echo` prints
+        text = re.sub(r"\A%YAML.*\n", "", read_text(path))
+        return _read_content(parse_yaml_documents(text, path), path, name)
     with path.open("rb") as file:
         head = file.read(_HEAD_BYTES).decode("utf-8", "replace")
     raise FileError(path, _unknown(f"a file {suffix or 'without a suffix'} is", head))
@@ -286,85 +269,21 @@ def _unknown(what: str, text: str = "") -> str:
     )
 
 
-def _read_documents(path: Path) -> list[dict[str, Any]]:
-    """The mappings of a file: several of a YAML file, as ``ros2 topic echo`` prints them."""
-    if path.suffix.lower() == ".json":
-        return [read_json(path)]
-    return parse_yaml_documents(re.sub(r"\A%YAML.*\n", "", read_text(path)), path)
-
-
 def _read_content(documents: list[dict[str, Any]], path: Path, name: str | None) -> RigParts:
     content = documents[0]
-    if is_tf2(content):
+    if "transforms" in content or {"transform", "child_frame_id"} <= content.keys():
         return read_tf2(documents, path)
-    if _is_camera_info(content):
-        documents = [content, *(each for each in documents if _message(each) != _message(content))]
     if len(documents) > 1:
-        raise FileError(path, f"holds {len(documents)} different YAML documents; keep one of them")
-    if _is_camera_info(content):
-        return _read_camera_info(content, path, name)
+        raise FileError(path, f"holds {len(documents)} YAML documents; keep one of them")
     if "format" in content or is_exported_rig(content):
         return _part_of_rig(path)
-    if is_autoware(content):
+    if any(isinstance(pose, dict) and "roll" in pose for _, _, pose in _entries(content)):
         return read_autoware(content, path)
     found = read_foreign(content, path, name)
     if found is None:
         keys = ", ".join(str(key) for key in list(content)[:5])
         raise FileError(path, _unknown(f"its keys ({keys}) are"))
     return found
-
-
-def _message(content: dict[str, Any]) -> dict[str, Any]:
-    """A message without its header, whose stamp changes."""
-    return {**content, "header": None}
-
-
-_Count = Annotated[int, Field(ge=0, le=1_000_000)]
-
-
-_Nine = Annotated[list[Finite], Field(min_length=9, max_length=9)]
-_Twelve = Annotated[list[Finite], Field(min_length=12, max_length=12)]
-
-
-class _Header(Foreign):
-    frame_id: str = ""
-
-
-class _Window(Foreign):
-    x_offset: _Count = 0
-    y_offset: _Count = 0
-    height: _Count = 0
-    width: _Count = 0
-
-
-class _Message(Foreign):
-    header: _Header = _Header()
-    height: Size
-    width: Size
-    distortion_model: str
-    d: list[Finite]
-    k: _Nine
-    r: _Nine
-    p: _Twelve
-    binning_x: _Count = 0
-    binning_y: _Count = 0
-    roi: _Window = _Window()
-
-
-def _is_camera_info(content: dict[str, Any]) -> bool:
-    """Whether the content of a file is a CameraInfo message, as ``ros2 topic echo`` prints it."""
-    keys = {str(key).lower() for key in content}  # in capitals: K of ROS 1
-    return {"height", "width", "distortion_model", "k", "d", "p"} <= keys
-
-
-def _read_camera_info(content: dict[str, Any], path: Path, name: str | None) -> RigParts:
-    """The lens of the images as recorded (K and D, not the rectified P), and the camera's frame."""
-    message = checked_model(_Message, {str(key).lower(): v for key, v in content.items()}, path)
-    stated = lens_of(SimpleNamespace(**dict(message)), str(path), rectified=False)
-    camera = name or path.stem
-    return RigParts(
-        path, {camera: stated.lens}, frame_ids={camera: stated.frame} if stated.frame else {}
-    )
 
 
 def _part_of_rig(path: Path) -> RigParts:
@@ -383,10 +302,7 @@ def _part_of_rig(path: Path) -> RigParts:
             for name, c in cameras
         },
         T_camera_lidar=rig.T_camera_lidar,
-        relative_poses=tuple(
-            RelativeCamera(p.a, p.b, p.T_a_b, p.rotation_sigma_rad, p.translation_sigma_m)
-            for p in rig.relative_poses
-        ),
+        relative_poses=rig.relative_poses,
         frame_ids={name: each.frame_id for name, each in cameras if each.frame_id},
         mounts={name: each.mount for name, each in cameras if each.mount},
         lidar=rig.lidar,

@@ -6,7 +6,7 @@ Features are SIFT keypoints and descriptors, with the rays of the keypoints.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations
 
@@ -111,7 +111,7 @@ def with_surfaces(table: CameraMatches, dataset: Dataset, rig: Rig) -> CameraMat
     with core_pool() as cores:
         for rows, found in cores.map(partial(_planes_of_frame, table=table, rig=rig), seen):
             planes[rows] = found
-    return table.with_planes(planes)
+    return replace(table, planes_lidar_per_m=planes)
 
 
 def _planes_of_frame(

@@ -152,7 +152,6 @@ def to_table(
         pixels_px=pixels[kept].reshape(-1, 2),
         points_lidar_m=job.cloud[index, :3],
         confidence=_bound(confidence),
-        point_index=index,
     )
 
 

@@ -12,13 +12,7 @@ from calibgraph.model.rig import Camera
 from factors import unproject
 from factors.arrays import contiguous
 from factors.compiled import compiled
-from factors.lens_kernels import (
-    EQUIRECTANGULAR,
-    PINHOLE,
-    is_projectable,
-    project_one,
-    subtract_columns,
-)
+from factors.lens_kernels import PINHOLE, is_projectable, project_one
 
 Rows = NDArray[np.intp]
 
@@ -87,12 +81,7 @@ def _find_places(kind: int) -> Any:
                 y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
                 z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
                 projection = project_one(kind, lens, x, y, z)
-                u = projection[0]
-                if p == 0:
-                    centre = u
-                elif kind == EQUIRECTANGULAR:  # a window across the seam of a panorama stays whole
-                    u = centre + subtract_columns(kind, lens, u, centre)
-                places[w, p, 0] = round((u + 0.5) * scale[0] - 0.5)
+                places[w, p, 0] = round((projection[0] + 0.5) * scale[0] - 0.5)
                 places[w, p, 1] = round((projection[1] + 0.5) * scale[1] - 0.5)
 
     return run

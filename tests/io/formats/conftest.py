@@ -35,11 +35,6 @@ def varied_rig() -> Rig:
     )
 
 
-def rig_for(format: str) -> Rig:
-    """A rig with as much as a format can hold."""
-    return varied_rig()
-
-
 @pytest.fixture(scope="session")
 def solved() -> Calibration:
     """A result with error bars."""

@@ -75,14 +75,6 @@ def test_a_model_is_understood_under_any_key(index: int, write: Writer, tmp_path
     assert (camera.model, list(camera.distortion)) == ("fisheye", FOUR)
 
 
-@pytest.mark.parametrize("name", FISHEYES)
-def test_names_of_fisheyes_are_understood_in_a_camchain(name: str, tmp_path: Path) -> None:
-    camera = {"camera_model": "pinhole", "distortion_model": name, "resolution": [1280, 800],
-              "intrinsics": [320, 320, 640, 400], "distortion_coeffs": FOUR,
-              "T_cam_lidar": FRONT.tolist()}  # fmt: skip
-    assert camera_of(as_yaml(tmp_path, {"cam0": camera})).model == "fisheye"
-
-
 FOCAL = {"fx": 320.0, "fy": 320.0, "cx": 640.0, "cy": 400.0, "width": 1280, "height": 800}
 NAMED = {**FOCAL, "T_C_L": FRONT.tolist(), "k1": 0.1, "k2": 0.0}
 FIVE, ZEROS, NOTE = [*FOUR, 0.1], [0.0] * 5, "four numbers and no key names the lens model"
