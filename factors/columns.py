@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from factors import kernel
+from factors.arrays import read_only
 from factors.lens import Lens, LensModel
 from factors.lens_kernels import FISHEYE, OMNIDIRECTIONAL, PINHOLE
 
@@ -135,7 +136,7 @@ class Columns:
     def packed(self) -> tuple[NDArray[np.int64], Array]:
         """(k,) numbers of the parameters for the kernel, and (k,) their units."""
         numbers = [_NUMBERS[name] for name in self.parameters]
-        return np.array(numbers, np.int64), np.array(self.sigmas, np.float64)
+        return read_only(np.array(numbers, np.int64)), read_only(np.array(self.sigmas))
 
     def displacements(self, points_lidar_m: Array, rows_px: Array, twists_per_s: Array) -> Array:
         """(m, 3, n) of points in the LiDAR frame by a unit of each parameter that displaces them.

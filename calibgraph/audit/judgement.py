@@ -23,7 +23,7 @@ from calibgraph.arrays import Array, Mask
 from calibgraph.audit.result import CameraAudit
 from calibgraph.model.error_sources import MATCHES, MOST_TIMES, ErrorSources
 from calibgraph.model.findings import UNKNOWN, MatcherFindings, error_components
-from calibgraph.model.geometry import to_T_lidar_camera, twist_between
+from calibgraph.model.geometry import twist_between
 from calibgraph.solver.covariance import ENOUGH_FRAMES, PSEUDO_FRAMES
 from calibgraph.tracking.cause import Steps, find_cause
 from calibgraph.trust.evidence import Evidence
@@ -211,7 +211,7 @@ def find_lidar_motion(
         step=deviation,
         covariance=covariance,
         limits=np.full(cameras, float(chdtri(6, FALSE_ALARM_RATE / cameras))),
-        T_lidar_camera=tuple(to_T_lidar_camera(T) for T in T_camera_lidar),
+        T_camera_lidar=np.array(T_camera_lidar),
     )
     lidar = find_cause(steps, moved).lidar
     if lidar is None:

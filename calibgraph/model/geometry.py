@@ -15,7 +15,8 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from calibgraph.arrays import Array
-from calibgraph.model.pose_kernel import exponential_times, logarithms
+from factors.arrays import contiguous
+from factors.pose_kernel import exponential_times, logarithms
 
 
 def transform(rotation: Rotation | ArrayLike, translation: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
@@ -165,11 +166,6 @@ def relative_covariance(joint: Array, a: int, b: int, T_b_a: Array) -> Array:
     return covariance
 
 
-def adjoint_camera_lidar(T_lidar_camera: gtsam.Pose3) -> Array:
-    """(6, 6) Ad(T_lidar_camera^-1): a twist in the LiDAR frame to the same in the camera's."""
-    return np.asarray(T_lidar_camera.inverse().AdjointMap(), dtype=np.float64)
-
-
 def adjoints(T_a_b: Array) -> Array:
     """(f, 6, 6) Ad(T_a_b) of (f, 4, 4): twists in b, rotation first, to the same in a."""
     R, crosses = T_a_b[:, :3, :3], np.zeros((len(T_a_b), 3, 3))
@@ -191,7 +187,7 @@ def retract_all(T_camera_lidar: Array, steps: Array) -> Array:
         steps: (f, 6) tangents of T_lidar_camera: rotation [rad], translation [m].
     """
     moved = np.empty((len(steps), 4, 4))
-    exponential_times(-steps, np.ascontiguousarray(T_camera_lidar), moved)
+    exponential_times(contiguous(-steps), contiguous(T_camera_lidar), moved)
     return moved
 
 

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.model.calibration import Calibration
-from calibgraph.model.geometry import to_T_lidar_camera
 from calibgraph.solver.matches import CameraBlock, camera_blocks
 from calibgraph.solver.preprocess import preprocess
 
@@ -161,7 +160,7 @@ def reprojection_errors(result: Calibration) -> dict[str, ReprojectionErrors]:
 def _errors_at(T_camera_lidar: Array, matches: CameraBlock, gate_px: float) -> ReprojectionErrors:
     """The errors of those matches that project into the camera at this extrinsic."""
     block = matches.block
-    residuals, valid = block.residuals(to_T_lidar_camera(T_camera_lidar))
+    residuals, valid = block.residuals(T_camera_lidar[None])
     everything = ReprojectionErrors(
         pixels_px=block.pixels_px,
         vectors_px=constrained(residuals, matches.information),

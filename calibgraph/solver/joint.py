@@ -84,8 +84,8 @@ def solve_joint(
             rig, kept.counts, tied, config.excluded_cameras)
 
     with watch("stage1"):
-        pairwise = pairwise or estimate_stage1(rig, kept.table, config)    # Stage 1: T_hat
         blocks = camera_blocks(rig, kept.table, config)                    # weights w_ik
+        pairwise = pairwise or estimate_stage1(rig, blocks, config)        # Stage 1: T_hat
         start = best_start(rig, blocks, pairwise, config, terms=terms, tied=tied)     # x_0
 
     with watch("weights"):                                                 # ours: frame weights

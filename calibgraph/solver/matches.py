@@ -16,7 +16,6 @@ from calibgraph.model.calibration import Residuals
 from calibgraph.model.clock import at_pixels, motion_of
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
-from calibgraph.model.geometry import to_T_lidar_camera
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.solver.robust import (
     IDENTITY,
@@ -122,7 +121,7 @@ class CameraBlock:
 
         Args:
             T_camera_lidar: (1, 4, 4), or (r, 4, 4) with one of each run.
-            runs: (r, 2) of all correspondences, see ``ProjectionBlock.run_residuals``.
+            runs: (r, 2) of all correspondences, see ``ProjectionBlock.residuals``.
 
         Returns:
             (n,) unweighted errors [px]; (n,) whitened errors; infinite where a point is not
@@ -132,8 +131,7 @@ class CameraBlock:
         if self.information is None:
             norms = self.block.run_norms(T_camera_lidar, runs, factor=1.0 / float(medians))
             return norms[0], norms[-1]
-        runs = np.array([[0, len(self.frame)]]) if runs is None else runs
-        residuals, projectable = self.block.run_residuals(T_camera_lidar, runs)
+        residuals, projectable = self.block.residuals(T_camera_lidar, runs)
         sizes_px = constrained_error_px(residuals, self.information) / medians
         sizes = whitened_norm(self.block.sqrt_information, residuals) / medians
         return np.where(projectable, sizes_px, np.inf), np.where(projectable, sizes, np.inf)
@@ -154,7 +152,7 @@ class CameraBlock:
         the other, and their gradients with them. The term is some percent of the Hessian, and
         negative. It is measured on the matches near the edge, on both sides of it.
         """
-        residuals, projectable = self.block.residuals(to_T_lidar_camera(T_camera_lidar))
+        residuals, projectable = self.block.residuals(T_camera_lidar[None])
         errors = constrained_error_px(residuals, self.information)
         near = np.abs(errors - scale.gate_px) < _GATE_BAND * scale.gate_px
         edge = self.select(near & projectable)

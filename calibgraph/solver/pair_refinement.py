@@ -29,11 +29,11 @@ from calibgraph.solver.pairs import (
 )
 from calibgraph.solver.places import lengthen
 from calibgraph.solver.pnp import DAMPING
-from calibgraph.solver.two_pass import Objective, Optimum
+from calibgraph.solver.two_pass import RELATIVE_TOLERANCE, Objective, Optimum
 from factors import pose_sigmas
 
 _NARROWINGS = 3  # steps at most from the spread at the estimate to the least one, by half each
-_COARSE = 1e-6  # relative change of the error at which each of them stops
+_COARSE = 1e-5  # relative change of the error at which each of them stops
 _MAX_STEPS, _MAX_STEP, _CONVERGED = 30, 0.1, 1e-5  # of a pair alone: rad, m
 _SETTLED, _MOST = 0.005, 9  # relative change of a spread that ends its measuring, and its steps
 Places = Mapping[frozenset[str], Mapping[str, Array]]
@@ -72,7 +72,9 @@ def refine_with_pairs(
         T = near.minimize(T, at.scales, tolerance=_COARSE).T_camera_lidar
     kept = [t.without_outliers(T, s) for t, s in zip(scaled, sigmas.tolist(), strict=True)]
     joined = inliers.with_pairs(kept)
-    return joined, joined.minimize(T, at.scales)
+    goes_on = inliers.config.preset == "auto"  # to the optimum of the error model
+    tolerance = _COARSE if goes_on else RELATIVE_TOLERANCE
+    return joined, joined.minimize(T, at.scales, tolerance=tolerance)
 
 
 def place_pairs(terms: Sequence[PairTerm], T_camera_lidar: Mapping[str, Array]) -> Places:

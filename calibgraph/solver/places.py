@@ -30,13 +30,14 @@ import numpy as np
 from calibgraph.arrays import Array
 from calibgraph.graph.components import VarianceRatios
 from calibgraph.graph.latent_poses import LatentPoseModel, right_jacobians, to_ordering
-from calibgraph.graph.lens import start_lenses
 from calibgraph.graph.variables import (
     CLOUD,
     DISTORTION,
     camera_key,
+    lens_key,
     matched_key,
     paired_key,
+    seen_lens_key,
 )
 from calibgraph.model.geometry import (
     adjoints,
@@ -45,10 +46,10 @@ from calibgraph.model.geometry import (
     retract_all,
     to_T_lidar_camera,
 )
-from calibgraph.model.pose_kernel import logarithms
 from calibgraph.solver.two_pass import MAX_ITERATIONS
 from factors import BlockSums
 from factors.conditioning import unit_diagonal
+from factors.pose_kernel import logarithms
 
 TOLERANCE = 1e-6
 """Relative change of the cost at which it stops: some 1e-3 of the smallest standard deviations."""
@@ -193,8 +194,7 @@ class Linearization:
         """The sums of every pair by place, in the tangents of o_p, n_a and n_b: (r, 18, 18)."""
         found = []
         for pair in self.model.pairs:
-            numbers = [self.model.cameras.index(name) for name in (pair.a, pair.b)]
-            shown = _poses(self.shared, map(paired_key, numbers))
+            shown = _poses(self.shared, pair.keys)
             seen = self.inverses[0, pair.places] @ shown[:, None]
             sums = pair.block.run_sums(seen[0], seen[1], pair.edges)
             by_cloud = -adjoints(invert_each(seen.reshape(-1, 4, 4))).reshape(2, -1, 6, 6)
@@ -281,7 +281,7 @@ class Linearization:
         """(n, n) and (n,) gradient of linear factors of shared variables."""
         n, present = self.model.size, {*factors.keys()}
         hessian, gradient = np.zeros((n, n)), np.zeros(n)
-        keys = [key for key in self.model.shared_keys if key in present]
+        keys = [key for key in self.model.columns if key in present]
         own, at = factors.hessian(to_ordering(keys)), self.model.columns_of(keys)
         hessian[np.ix_(at, at)], gradient[at] = own[0], -own[1]
         return hessian, gradient
@@ -501,18 +501,17 @@ def lengthen(share: float, left: float) -> float:
 
 def start_values(model: LatentPoseModel, T_camera_lidar: Mapping[str, Array]) -> Linearization:
     """All poses of a camera at its (4, 4) extrinsic, the cloud and lenses where they are."""
-    shared, T = start_lenses(model.lenses), [T_camera_lidar[name] for name in model.cameras]
-    poses = [*map(to_T_lidar_camera, T)]
-    for of, numbers in (
-        (camera_key, range(len(poses))),
-        (matched_key, model.matched),
-        (paired_key, model.paired),
-    ):
-        for number in numbers:
-            shared.insert(of(number), poses[number])
+    shared, T = gtsam.Values(), [T_camera_lidar[name] for name in model.cameras]
+    for number, pose in enumerate(map(to_T_lidar_camera, T)):
+        for key in (camera_key(number), matched_key(number), paired_key(number)):
+            if key in model.columns:
+                shared.insert(key, pose)
+    for number, term in model.lenses.items():
+        for key in (lens_key(number), seen_lens_key(number)):
+            shared.insert(key, term.variable.values)
     shared.insert(CLOUD, gtsam.Pose3())
     if model.is_distorted:
-        shared.insert(DISTORTION, np.zeros(model.components.distortion_jacobian.shape[2]))
+        shared.insert(DISTORTION, np.zeros(len(model.columns[DISTORTION])))
     each = np.array([np.eye(4), *(T[number] for number in model.matched)])
     return Linearization(model, shared, np.tile(each[:, None], (1, model.places, 1, 1)))
 

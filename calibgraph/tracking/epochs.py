@@ -7,11 +7,9 @@ import numpy as np
 from calibgraph.arrays import Array
 from calibgraph.model.geometry import (
     invert_each,
-    local_coordinates,
     retract_all,
     to_T_lidar_camera,
 )
-from calibgraph.model.pose_kernel import logarithms
 from calibgraph.solver.robust import median_norm, robust_spread, scale_from
 from calibgraph.solver.within_place import WEAK
 from calibgraph.tracking.absorption import add_to_totals, count_epoch
@@ -22,6 +20,7 @@ from calibgraph.tracking.moves import report_drift, select_walk, shift_between, 
 from calibgraph.tracking.state import STRENGTHS, State
 from calibgraph.tracking.sums import Numbers, Sums
 from factors import to_runs
+from factors.pose_kernel import logarithms
 
 _GATE_STEPS = 4  # by the Hessian by weights, which descend: each leaves a fifth of the way
 _SMALL_STEP = 1e-2  # squared sigmas of independent matches
@@ -130,21 +129,20 @@ def _regate(state: State, camera: int, places: Numbers) -> None:
         state.put(camera, curvature=newest.curvature(scale))
     within = np.where(np.repeat(gated.enough, frames), within, own[1])
     counts = np.add.reduceat(within, starts, dtype=float)
-    steps = _linearized_at(state, camera, epochs, places[rows])
-    poses = retract_all(np.tile(state.references[camera], (len(steps), 1, 1)), steps)
+    poses = _linearized_at(state, camera, epochs, places[rows])
     state.put(camera, blocks=(raw,), inliers=(within,))
     sums = sums_of(state, {camera: Gated(poses, raw, within, counts)})
     state.sums = state.sums.replace_at((rows, camera), sums)
 
 
 def _linearized_at(state: State, camera: int, epochs: Numbers, places: Numbers) -> Array:
-    """(f, 6) steps from a camera's reference to where the matches of frames are linearized."""
+    """(f, 4, 4) T_camera_lidar at which the matches of frames are linearized."""
     if state.walk[camera]:
-        poses = invert_each(state.poses[epochs, camera])
-        return local_coordinates(state.references[camera], poses)
-    if state.config.preset != "auto":  # Eq. 5 knows no places
-        return np.zeros((len(epochs), 6))
-    return np.concatenate([state.steps[:, camera], np.zeros((1, 6))])[places]
+        return np.asarray(state.poses[epochs, camera])
+    steps = np.zeros((len(epochs), 6))
+    if state.config.preset == "auto":  # Eq. 5 knows no places
+        steps = np.concatenate([state.steps[:, camera], steps[:1]])[places]
+    return retract_all(np.tile(state.references[camera], (len(steps), 1, 1)), steps)
 
 
 # The summary of older epochs.

@@ -395,10 +395,11 @@ class EpochGraph:
             shown = np.outer(sigmas, sigmas) * (weight @ bends[:, 54:63]).reshape(size, size)
             vector = sigmas * (weight @ bends[:, 63:])
         each = np.tile(np.eye(6), (1, n, 1, 1))
-        components = VarianceComponents(
-            cloud=np.eye(6),
+        cloud, camera = common_error(findings.rigid_sigmas, findings.camera_share)
+        prior = VarianceComponents(
+            cloud=cloud,
             cloud_at_place=np.eye(6),
-            camera=np.eye(6),
+            camera=camera,
             pairs=np.eye(6),
             at_place=each,
             scatter_at_place=each,
@@ -407,7 +408,6 @@ class EpochGraph:
             distortion_information=shown,
             distortion_vector=vector,
         )
-        prior = common_error(components, findings.rigid_sigmas, findings.camera_share)
         components = VarianceRatios(shared=shared).scale(prior)
         return SharedModel(state.names, {}, (), self.pose_graph, components, state.config.of)
 

@@ -23,8 +23,7 @@ import gtsam
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.model.geometry import adjoints, invert, pose_rows, retract_all, to_T_lidar_camera
-from calibgraph.model.pose_kernel import logarithms
+from calibgraph.model.geometry import adjoints, invert, pose_rows, retract_all
 from calibgraph.solver.components import pose_covariance
 from calibgraph.solver.matches import MIN_MATCHES, CameraBlock, merge
 from calibgraph.solver.within_place import WEAK
@@ -45,6 +44,7 @@ from calibgraph.tracking.gate import Gated, agrees, refine, sums_of
 from calibgraph.tracking.state import STRENGTHS, DriftWatch, OutlierFrame, State, rows_of
 from calibgraph.tracking.sums import Sums
 from factors import to_runs
+from factors.pose_kernel import logarithms
 
 Scatters = Mapping[int, Array]
 
@@ -82,10 +82,9 @@ def steps_between(
     if by_places is not None:
         covariance += by_places[np.ix_(rows, rows)]
     limits = alarm_limit(state.total_frames[cameras])
-    references = tuple(map(to_T_lidar_camera, state.references[cameras]))
     apart = np.ravel(ends[1] - ends[0])
     return (
-        Steps(tuple(cameras), apart, covariance, limits, references),
+        Steps(tuple(cameras), apart, covariance, limits, state.references[cameras]),
         dict(zip(cameras, ends[1], strict=True)),
     )
 
@@ -438,7 +437,7 @@ def _date_step(state: State, detected: DetectedStep) -> tuple[DetectedStep, Meas
         raw = merge(_blocks_since(state, replace(detected, since=numbers[0]), camera))
         ends, runs = np.stack([now[camera] - step, now[camera]]), to_runs(raw.frame_edges)
         before, after = (
-            raw.with_scale(state.scales[camera]).run_sums(np.tile(T, (len(runs), 1, 1)), runs).cost
+            raw.with_scale(state.scales[camera]).summarize(np.tile(T, (len(runs), 1, 1)), runs).cost
             for T in retract_all(np.tile(state.references[camera], (2, 1, 1)), ends)
         )
         rows = np.searchsorted(numbers, raw.frame_numbers)

@@ -50,13 +50,11 @@ from calibgraph.trust.lens_parameter import (
     Free,
     LensParameter,
     check_parameter,
-    lens_fields_px,
     lens_variable,
-    units_of,
 )
 from calibgraph.trust.pose_posterior import FrameScorer, Images
 from calibgraph.trust.thresholds import limit, threshold
-from factors import Columns, displace
+from factors import Columns, displace, fields_px
 from factors.columns import DISTORTION
 
 WIDE, FINER = LEVELS[1], LEVELS[2]
@@ -197,7 +195,7 @@ def measure_lens(  # noqa: PLR0913 - what is measured, and by what
     rest = _fit_at_peaks(scorer, refined, again, np.zeros(len(best)), places=places)
     if rest is None:
         return ()
-    fine, units, parameters = rest.counted_from(moved), units_of(camera), []
+    fine, units, parameters = rest.counted_from(moved), np.array(lens.free.sigmas), []
     for name, number in zip(NAMES, searched, strict=True):
         fit, others = fine if number in finer else rough, [n for n in finer if n != number]
         of = LensParameter.of(name, units[[number]], fit.free(*others, number))
@@ -212,7 +210,8 @@ def _with_lens(scorer: FrameScorer, camera: Camera, scores: ShiftScores) -> Shif
     of_groups = np.array([known[number] for number in scores.frame.tolist()]).reshape(-1, 6)
     times_s = clock_of(camera).times_s(scores.pixels_px[:, 1])
     points_m = displace(scores.points_lidar_m, of_groups, -times_s)
-    return scores.with_unknowns(lens_fields_px(camera, points_m))
+    free = lens_variable(camera).free
+    return scores.with_unknowns(fields_px(points_m, camera.T_camera_lidar, free)[1][6:])
 
 
 def _search(camera: Camera, scores: ShiftScores, lens: tuple[int, ...], seed: int) -> Array:
@@ -299,6 +298,8 @@ def check_images(
     evidence = measure_image_evidence(
         dataset, Rig(cameras=cameras), places=table.places, seed=seed, progress=progress
     )
+    if table.is_swept:
+        evidence = {name: replace(found, lens=()) for name, found in evidence.items()}
     names = {frame.index: frame.name for frame in dataset.frames}
     return {
         name: (*evidence_checks(found, names, tolerance), *pairing_checks(found))

@@ -12,7 +12,7 @@ mean, not the sum: with that the truth is as likely under it as by one camera al
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -35,7 +35,7 @@ from calibgraph.matching.structure.shift_scores import (
     score_frame,
 )
 from calibgraph.model.geometry import pose_rows, relative_transform, twist_between
-from calibgraph.model.rig import Camera, RelativePose, Rig
+from calibgraph.model.rig import Camera, Rig
 from calibgraph.parallel import Threads, core_pool
 from calibgraph.trust.probability import probability_beyond
 from factors import pose_sigmas
@@ -256,13 +256,6 @@ MeasurePosteriors = Callable[
 ]
 """The posteriors by the images, of the (6, 6) covariances by the matches and of groups of cameras
 that move together."""
-
-
-def measured_pairs(poses: Iterable[RelativePose]) -> Iterator[tuple[str, str, Array]]:
-    """Relative poses of a rig with their (6, 6) covariances."""
-    for pose in poses:
-        sigmas = np.repeat([pose.rotation_sigma_rad, pose.translation_sigma_m], 3)
-        yield pose.a, pose.b, np.diag(sigmas**2)
 
 
 _EFFECTIVE = 0.8  # share of the samples that each step keeps

@@ -183,8 +183,8 @@ def weaknesses(solution: Solution, camera: str, covariance: Array | None) -> tup
     how = "weakest direction"
     if covariance is None:
         how = "weakest direction, by the matches as if each were independent"
-        independent = solution.fitted.projections[camera].sums(solution.fitted.pose(camera))
-        covariance = invert_or_none(independent.hessian)
+        independent = solution.fitted.frame_sums[camera].hessian.sum(axis=0)
+        covariance = invert_or_none(independent)
     direction = [] if covariance is None else [f"{how}: {weakest_direction(covariance)}"]
     T = solution.T_camera_lidar[camera]
     return (*direction, *empty_parts(solution.rig.cameras[camera], block, T))

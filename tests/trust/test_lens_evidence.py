@@ -101,10 +101,10 @@ class _Seen(Exception):
 def test_the_lens_is_applied_to_points_where_they_are_when_they_are_seen(
     truth: Camera, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def see(_: Camera, points_m: np.ndarray) -> np.ndarray:
+    def see(points_m: np.ndarray, *_: object) -> np.ndarray:
         raise _Seen(points_m)
 
-    monkeypatch.setattr(image_evidence, "lens_fields_px", see)
+    monkeypatch.setattr(image_evidence, "fields_px", see)
     late = truth.model_copy(update={"time_offset_s": 0.05})
     data, twist = calibgraph.load_dataset(SAMPLE, Rig(cameras={NAME: late})), np.arange(6.0)
     files = [(f.index, f.name, f.cloud_path, f.image_paths) for f in data.frames[:2]]
