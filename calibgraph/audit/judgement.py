@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 from scipy.special import chdtri, fdtri, ndtri, stdtrit
 
 from calibgraph.arrays import Array, Mask
-from calibgraph.audit.result import CameraAudit, LidarAudit
+from calibgraph.audit.result import CameraAudit
 from calibgraph.model.error_sources import MATCHES, MOST_TIMES, ErrorSources
 from calibgraph.model.findings import UNKNOWN, MatcherFindings, error_components
 from calibgraph.model.geometry import twist_between
@@ -191,7 +191,7 @@ def find_lidar_motion(
     *,
     moved: Collection[int],
     quantile: float,
-) -> LidarAudit | None:
+) -> CameraAudit | None:
     """The motion of the LiDAR, if one explains the deviations of all cameras; else None.
 
     A LiDAR beside it is a camera here.
@@ -218,7 +218,8 @@ def find_lidar_motion(
         return None
     motion, sigma = -lidar[0], np.sqrt(np.diag(lidar[1]))
     clear = np.abs(motion) > quantile * sigma
-    return LidarAudit(describe_motion(motion, sigma, clear, LIDAR_AXES), motion, sigma)
+    reason = describe_motion(motion, sigma, clear, LIDAR_AXES)
+    return CameraAudit("WRONG", reason, motion, sigma)
 
 
 def describe_motion(motion: Array, sigma: Array, which: Mask, axes: tuple[str, ...]) -> str:

@@ -24,6 +24,7 @@ from calibgraph.model.rig import RelativePose
 from calibgraph.solver.components import (
     Component,
     Evidence,
+    common_error,
     pose_covariance,
     ratios_by_evidence,
 )
@@ -393,11 +394,11 @@ class EpochGraph:
             shown = np.outer(sigmas, sigmas) * (weight @ bends[:, 54:63]).reshape(size, size)
             vector = sigmas * (weight @ bends[:, 63:])
         each = np.tile(np.eye(6), (1, n, 1, 1))
-        whole, of_cameras = shared * np.square(findings.rigid_sigmas), findings.camera_share
+        cloud, camera = common_error(findings.rigid_sigmas, findings.camera_share)
         components = VarianceComponents(
-            cloud=pose_covariance(*((1.0 - of_cameras) * whole)),
+            cloud=shared * cloud,
             cloud_at_place=np.eye(6),
-            camera=pose_covariance(*(of_cameras * whole)),
+            camera=shared * camera,
             pairs=np.eye(6),
             at_place=each,
             scatter_at_place=each,

@@ -234,7 +234,7 @@ def test_what_is_reported_is_optimum_and_marginal_of_the_graph() -> None:
     marginals = gtsam.Marginals(graph, values)
     model = tracker._graph.window.model
     expected, rows = model.reported(values, "alignment")
-    joint = rows @ marginals.jointMarginalCovariance(model.shared_keys).fullMatrix() @ rows.T
+    joint = rows @ marginals.jointMarginalCovariance([*model.columns]).fullMatrix() @ rows.T
     for camera, name in enumerate(("left", "right")):
         own = slice(6 * camera, 6 * camera + 6)
         reported = update.covariance[name]
