@@ -195,7 +195,11 @@ class IncrementalCalibrator:
         Of half the frames, while one of them disagrees or a camera may start.
         """
         group, table, repeated, blocks = _preprocessed(state, group, self._graph_of(state).rig)
-        gated = _gate(state, blocks)
+        gated = {
+            camera: Gated.at(state.references[camera], block, state.scales[camera])
+            for camera, block in blocks.items()
+            if state.started[camera]
+        }
         usual = gated.keys() == blocks.keys()  # no camera may start
         usual = usual and all(one.agree(state, camera).all() for camera, one in gated.items())
         if not usual and group[1:]:
@@ -322,23 +326,10 @@ def _preprocessed(
     for camera, (first, end) in enumerate(pairwise(edges)):
         if end - first >= MIN_MATCHES:
             block = camera_block(cameras[camera], usable.select(rows[first:end]), config)
-            block = block if len(group) == 1 else _with_enough(block)
-            found |= {camera: block} if len(block) else {}
+            enough = block.frame_counts >= MIN_MATCHES
+            if enough.any():
+                found[camera] = block.select(np.repeat(enough, block.frame_counts))
     return group, table, repeated, found
-
-
-def _with_enough(block: CameraBlock) -> CameraBlock:
-    enough = block.frame_counts >= MIN_MATCHES
-    return block if enough.all() else block.select(np.repeat(enough, block.frame_counts))
-
-
-def _gate(state: State, blocks: Mapping[int, CameraBlock]) -> dict[int, Gated]:
-    """The matches of cameras that have started, gated at their estimates."""
-    return {
-        camera: Gated.at(state.references[camera], block, state.scales[camera])
-        for camera, block in blocks.items()
-        if state.started[camera]
-    }
 
 
 _FRAMES, _MATCHES = 24, 250  # enough to start a camera, close two epochs and fill a large block
