@@ -3,7 +3,6 @@
 from .audit import Audit as Audit
 from .audit import CameraAudit as CameraAudit
 from .audit import Drift as Drift
-from .audit import LidarAudit as LidarAudit
 from .audit import check as check
 from .audit import drift as drift
 from .audit.fleet_model import FleetModel as FleetModel

@@ -37,9 +37,8 @@ from calibgraph.trust.evidence import Evidence, gather
 from calibgraph.trust.image_record import ImageRecord, RunChecks, to_metadata
 from calibgraph.trust.inputs import registered_twists
 from calibgraph.trust.lens_checks import asks_offset
-from calibgraph.trust.observability import weaknesses
 from calibgraph.trust.probability import TABLES, judge, model_of
-from calibgraph.trust.solution_checks import residuals_of
+from calibgraph.trust.solution_checks import residuals_of, weaknesses
 from calibgraph.vehicle.rig import LidarResult, calibrate_rig_lidars
 
 _log = logging.getLogger(__name__)

@@ -110,7 +110,7 @@ API = {
     "judge": """
         calibrate solve load_config preset evaluate perturb check write_audit_report drift
         Calibration Residuals Verdict Check Config Evaluation PoseError Audit CameraAudit
-        LidarAudit Drift
+        Drift
     """,
     "data": """
         load_dataset dataset_from_arrays cloud_from_message image_from_message

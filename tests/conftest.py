@@ -30,7 +30,7 @@ from calibgraph import (
 from calibgraph.cli import app as cli
 from calibgraph.cli import terminal
 from calibgraph.simulation.world import INSTALL_LIBRARIES
-from calibgraph.trust import assess, image_checks, inputs
+from calibgraph.trust import assess, image_evidence, inputs
 
 Call = Callable[..., tuple[int, str, str]]
 
@@ -198,7 +198,7 @@ def calibrate_sample(folder: Path) -> CommandRun:
 @pytest.fixture
 def no_image_checks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Do not check results and guesses against the images, for tests of all else."""
-    monkeypatch.setattr(image_checks, "check_images", lambda *_, **__: {})
+    monkeypatch.setattr(image_evidence, "check_images", lambda *_, **__: {})
     for module in (assess, inputs):
         monkeypatch.setattr(module, "likely_intended_guess", lambda *_: None)
 

@@ -42,7 +42,7 @@ from calibgraph import (
 )
 from calibgraph.audit.judgement import CAMERA_AXES, FALSE_ALARM_RATE, POWER, Limits
 from calibgraph.audit.result import by_unit
-from calibgraph.simulation.scan_errors import draw_scan_errors
+from tools.scenes.scan_errors import draw_scan_errors
 from tools.scenes.sensor_streets import ALIGNMENT, RIGS, aligned_rig, mean_poses, render
 
 Array = NDArray[np.float64]
@@ -219,7 +219,7 @@ def to_record(audit: Audit) -> Record:
     return {
         "wrong": list(audit.wrong),
         "cameras": {name: _camera(camera, rate) for name, camera in audit.cameras.items()},
-        "motion": None if audit.lidar is None else by_unit("motion", audit.lidar.motion),
+        "motion": None if audit.lidar is None else by_unit("motion", audit.lidar.deviation),
     }
 
 

@@ -26,7 +26,7 @@ from benchmarks.accuracy.ledger import Key, Record
 from benchmarks.accuracy.scenes import Folders
 from benchmarks.accuracy.verdicts import STATUSES, class_of
 from benchmarks.tables import ROOT, Table
-from calibgraph import Calibration, Config, Dataset, Rig, calibrate, evaluate, load_dataset, perturb
+from calibgraph import Calibration, Config, Dataset, Rig, calibrate, load_dataset, perturb
 from calibgraph.model.rig import Camera
 from factors.columns import COEFFICIENT_NUMBERS
 from tests.draws.lenses import put_lens_error
@@ -117,10 +117,8 @@ def values_of(camera: Camera) -> dict[str, float]:
 
 def _to_record(result: Calibration, truth: Rig) -> Record:
     record = ledger.to_record(result, truth)
-    corners_px = evaluate(result.rig, truth).lens_px
     for name, camera in record["cameras"].items():
         right = values_of(truth.cameras[name])
-        camera["corners_px"] = corners_px.get(name, 0.0)
         camera["lens"] = [
             {**vars(one), "right": right[one.name], "z": (one.value - right[one.name]) / one.sigma}
             for one in result.lens.get(name, ())
@@ -148,32 +146,6 @@ def report_verdicts(level: str, records: Sequence[Record]) -> Table:
     return Table(f"{level}: cameras", columns, tuple(rows))
 
 
-def report_cameras(level: str, records: Sequence[Record]) -> Table:
-    """A row per camera."""
-    columns = (
-        "recording", "case", "camera", "verdict", "[deg]", "[cm]", "NEES / 6", "corners [px]",
-        "the parameter farthest off, in sigmas", "sigma",
-    )  # fmt: skip
-    rows = [
-        (record["data"], record["kind"], name, camera["status"], f"{camera['error_deg']:.3f}",
-         f"{camera['error_cm']:.1f}", f"{camera['normalised_squared'] or np.nan:.2f}",
-         f"{camera['corners_px']:.1f}", *_farthest(camera))
-        for record in records
-        for name, camera in record.get("cameras", {}).items()
-    ]  # fmt: skip
-    rows += [(r["data"], r["kind"], "refused or crashed", *[""] * 7)
-             for r in records if "cameras" not in r]  # fmt: skip
-    return Table(f"{level}: each camera", columns, tuple(rows))
-
-
-def _farthest(camera: Record) -> tuple[str, str]:
-    one = max(camera["lens"], key=lambda each: abs(each["z"]), default=None)
-    if one is None:
-        return "-", "-"
-    error = one["value"] - one["right"]
-    return f"{one['name']} {error:+.3g}: {one['z']:+.1f}", f"{one['sigma']:.2g}"
-
-
 def main() -> None:
     """Run the cases that are left, and print the tables."""
     parser = ledger.case_parser(__doc__, "lens_cases")
@@ -194,7 +166,7 @@ def main() -> None:
     for level in options.sets:
         own = [record for record in records if record["level"] == level]
         if own:
-            tables += [report_verdicts(level, own), report_cameras(level, own)]
+            tables.append(report_verdicts(level, own))
     ledger.publish_cases(tables, records)
 
 

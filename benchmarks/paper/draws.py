@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.paper.aggregates import aggregate
 from benchmarks.paper.baselines import paper_solve
+from benchmarks.paper.scenarios import SCENARIOS, draw_scenario
 from calibgraph.errors import CorrespondenceError
 from calibgraph.io.dataset import load_dataset
 from calibgraph.io.kitti import CALIBRATION_NAME
@@ -27,7 +28,6 @@ from calibgraph.model.rig import RelativePose, Rig
 from calibgraph.progress import no_progress
 from calibgraph.rounds import match_in_rounds
 from calibgraph.simulation.rigs import rig_of
-from calibgraph.simulation.scenarios import SCENARIOS, draw_scenario
 from calibgraph.solver.joint import solve_joint
 from calibgraph.solver.matches import camera_blocks
 from calibgraph.solver.preprocess import preprocess

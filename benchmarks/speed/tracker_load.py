@@ -1,9 +1,8 @@
-"""Frames to many trackers at a rate: what is lost, how long it takes, processor time and memory.
+"""Frames of many trackers that send without a pause: frames a second, and processor time of each.
 
-    python -m benchmarks.speed.tracker_load [--trackers 200] [--hz 10] [--seconds 300]
+    python -m benchmarks.speed.tracker_load
 
-Each tracker gets a frame every 1 / hz seconds; a frame counts when it is acknowledged. Before, the
-processor time of a frame, of trackers that send without a pause. Clients and server share cores.
+Clients and server share cores.
 """
 
 from __future__ import annotations
@@ -17,7 +16,6 @@ import tempfile
 import time
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +31,6 @@ from calibgraph.yaml_text import yaml_text
 
 _FRAMES = 20
 _MATCHES = 20
-_MOST_AT_ONCE = 10  # frames: a robot that has waited for long drops older ones
 _READY_S = 120.0
 _COLUMNS = ("u_px", "v_px", "x_m", "y_m", "z_m")
 BEFORE = 30  # frames, after which a tracker has started
@@ -69,39 +66,12 @@ class Server:
         self.process.terminate()
         self.process.wait(60)
 
-    def memory_mb(self) -> tuple[float, float]:
-        """Resident memory of the server and of the largest worker."""
-        workers = self.process.children(recursive=True)
-        largest = max((one.memory_info().rss for one in workers), default=0)
-        return self.process.memory_info().rss / 1e6, largest / 1e6
-
     def processor_s(self) -> Array:
         """Of the workers, of those too that have ended, the server and this process so far."""
         own = self.process.cpu_times()
         workers = [one.cpu_times() for one in self.process.children(recursive=True)]
         of_workers = sum(sum(each[:4]) for each in workers) + sum(own[2:4])
         return np.array([of_workers, sum(own[:2]), time.process_time()])
-
-
-@dataclass
-class Counts:
-    """What was acknowledged.
-
-    Attributes:
-        seconds: of each request.
-        frames: acknowledged ones.
-        skipped: frames that were too old to be sent when an answer came.
-        refused: answers that were none.
-        memory_mb: of the server and the largest worker, over time.
-        last: the last frame that was acknowledged, by tracker.
-    """
-
-    seconds: list[float] = field(default_factory=list)
-    frames: int = 0
-    skipped: int = 0
-    refused: int = 0
-    memory_mb: list[tuple[float, float]] = field(default_factory=list)
-    last: dict[str, int] = field(default_factory=dict)
 
 
 def measure_costs(server: Server, cases: Sequence[tuple[int, int, int]] = CASES) -> Table:
@@ -141,27 +111,6 @@ async def _measure_cost(
     return str(trackers), str(together), rate, *(f"{ms:.2f}" for ms in each_ms)
 
 
-async def _track(server: Server, trackers: int, hz: float, seconds: float) -> Table:
-    """Send frames to trackers for some time; a frame that is late does not delay the others."""
-    truth = rig_of("kitti")
-    guess = perturb(truth, rotation_deg=0.5, translation_m=0.05, seed=1)
-    bodies = frame_bodies(truth)
-    limits = httpx.Limits(max_connections=None, max_keepalive_connections=trackers)
-    async with httpx.AsyncClient(base_url=server.url, timeout=120, limits=limits) as http:
-        places = [await _begin(http, guess) for _ in range(trackers)]
-        counts, start = Counts(), time.monotonic()
-        watching = asyncio.create_task(_watch(server, counts))
-        tasks = (
-            _drive(http, place, bodies, start + index / trackers / hz, hz, seconds, counts)
-            for index, place in enumerate(places)
-        )
-        await asyncio.gather(*tasks)
-        watching.cancel()
-        wall_s = time.monotonic() - start
-        lost = sum([await _last_frame(http, p) != last for p, last in counts.last.items()])
-    return _table(counts, lost, trackers, hz, wall_s)
-
-
 def frame_bodies(truth: Rig) -> list[Any]:
     """``cameras`` of some frames of a rig, as a line of JSON has them."""
     table = simulate_correspondences(
@@ -182,79 +131,17 @@ async def _begin(http: httpx.AsyncClient, rig: Rig) -> str:
     return place
 
 
-async def _drive(
-    http: httpx.AsyncClient, place: str, bodies: list[Any], start: float,
-    hz: float, seconds: float, counts: Counts,
-) -> None:  # fmt: skip
-    """Send what has come up since the last answer, the newest of it if that is much."""
-    frame = 0
-    while time.monotonic() < start + seconds:
-        due = int((time.monotonic() - start) * hz) + 1
-        if due <= frame:
-            await asyncio.sleep(max(0.0, start + frame / hz - time.monotonic()))
-            continue
-        counts.skipped += max(0, due - _MOST_AT_ONCE - frame)
-        frame = max(frame, due - _MOST_AT_ONCE)
-        lines = [
-            json.dumps({"frame": i, "cameras": bodies[i % _FRAMES]}) for i in range(frame, due)
-        ]
-        begun = time.perf_counter()
-        answer = await http.post(place, content="\n".join(lines))
-        if answer.is_success:
-            counts.seconds.append(time.perf_counter() - begun)
-            counts.frames += len(answer.json()["updates"])
-            frame, counts.last[place] = due, due - 1
-        else:
-            counts.refused += 1
-            await asyncio.sleep(1)
-
-
-async def _watch(server: Server, counts: Counts) -> None:
-    while True:
-        counts.memory_mb.append(server.memory_mb())
-        await asyncio.sleep(5)
-
-
-async def _last_frame(http: httpx.AsyncClient, place: str) -> int:
-    answer = await http.get(place)
-    return int(answer.raise_for_status().json()["frame"])
-
-
-def _table(counts: Counts, lost: int, trackers: int, hz: float, wall_s: float) -> Table:
-    p50, p99 = np.percentile(counts.seconds, [50, 99])
-    first, last = counts.memory_mb[len(counts.memory_mb) // 4], counts.memory_mb[-1]
-    rows = (
-        ("frames per second wanted", f"{trackers * hz:.0f}"),
-        ("frames per second acknowledged", f"{counts.frames / wall_s:.0f}"),
-        ("frames acknowledged", f"{counts.frames}"),
-        ("trackers whose last acknowledged frame is not in their state", f"{lost}"),
-        ("frames not sent: the service was behind", f"{counts.skipped}"),
-        ("requests, refused", f"{len(counts.seconds)}, {counts.refused}"),
-        ("frame to acknowledgement, p50 s", f"{p50:.3f}"),
-        ("frame to acknowledgement, p99 s", f"{p99:.3f}"),
-        ("server MB, at a quarter and at the end", f"{first[0]:.0f}, {last[0]:.0f}"),
-        ("largest worker MB, the same", f"{first[1]:.0f}, {last[1]:.0f}"),
-    )
-    return Table(f"{trackers} trackers at {hz:g} Hz, {wall_s:.0f} s", ("what", "found"), rows)
-
-
 def main() -> None:
     """Run the benchmark."""
     parser = parser_of(__doc__)
-    parser.add_argument("--trackers", type=int, default=200)
-    parser.add_argument("--hz", type=float, default=10.0)
-    parser.add_argument("--seconds", type=float, default=300.0)
     parser.add_argument("--port", type=int, default=8395)
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         server = Server(Path(temporary) / "data", options.port)
         try:
-            tables = [measure_costs(server)]
-            run = _track(server, options.trackers, options.hz, options.seconds)
-            tables.append(asyncio.run(run))
+            publish([measure_costs(server)])
         finally:
             server.stop()
-    publish(tables)
 
 
 if __name__ == "__main__":

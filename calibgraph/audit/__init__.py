@@ -2,13 +2,12 @@
 
 from calibgraph.audit.check import check
 from calibgraph.audit.drift import Drift, drift, drift_summary
-from calibgraph.audit.result import Audit, CameraAudit, LidarAudit, audit_summary
+from calibgraph.audit.result import Audit, CameraAudit, audit_summary
 
 __all__ = [
     "Audit",
     "CameraAudit",
     "Drift",
-    "LidarAudit",
     "audit_summary",
     "check",
     "drift",

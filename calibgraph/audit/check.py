@@ -20,7 +20,7 @@ from calibgraph.audit.judgement import (
     tolerance_twist,
 )
 from calibgraph.audit.lidars import MeasuredLidars, measure_lidars
-from calibgraph.audit.result import Audit, CameraAudit, LidarAudit
+from calibgraph.audit.result import Audit, CameraAudit
 from calibgraph.errors import CorrespondenceError, FileError
 from calibgraph.io.calibrations import stated_result
 from calibgraph.io.dataset import Dataset, keep_frames, load_dataset
@@ -53,8 +53,7 @@ from calibgraph.solver.solution import Solution
 from calibgraph.trust.agreement import competing_solution_checks, pair_agreement_checks
 from calibgraph.trust.evidence import Checks, Evidence, concatenate, gather_of_run
 from calibgraph.trust.guess import point_distance_checks
-from calibgraph.trust.image_checks import frames_check
-from calibgraph.trust.image_evidence import measure_image_evidence
+from calibgraph.trust.image_evidence import frames_check, measure_image_evidence
 from calibgraph.trust.inputs import describe_copies
 from calibgraph.trust.lens_checks import intrinsics_checks
 from calibgraph.trust.matcher_checks import last_round_checks, matcher_checks
@@ -127,24 +126,10 @@ def check(
                 deployed, given, Config(seed=seed), tolerance, sensors=sensors, progress=report
             )
     cameras, evidence = dict[str, CameraAudit](), None
-    try:
-        if deployed.cameras:
-            run = match_from_deployed(
-                data, deployed, full, Config(seed=seed), watch=watch, progress=report
-            )
-            with watch("places"):
-                run = assign_places(run)
-            run = refine_with_camera_pairs(run)
-            with watch("checks"):
-                cameras, evidence = _judge(run, tolerance, report)
-    except CorrespondenceError as error:
-        too_few_matches = error.camera in deployed.cameras and error.row is None
-        if not too_few_matches:  # a wrong table
-            raise
-        nothing = CameraAudit("CANNOT TELL", f"{error}; {SEARCHES_FARTHER}")
-        cameras = dict.fromkeys(deployed.cameras, nothing)
-    finally:
-        full.release()
+    if deployed.cameras:
+        cameras, evidence = _measure_cameras(
+            data, deployed, full, tolerance, config=Config(seed=seed), watch=watch, progress=report
+        )
     lidar = _judge_lidar(evidence, cameras, lidars, tolerance)
     middle = data.frames[len(data.frames) // 2].with_burnt_in({})  # as it was recorded
     sources = tuple(map(str, data.folders))
@@ -168,15 +153,31 @@ def _open(data: Dataset, deployed: Rig, matcher: FullMatcher) -> Dataset:
     return choice.dataset if most is None else choice.dataset.spread_out(most)
 
 
-def _judge(
-    run: MatchingRun, tolerance: Array, progress: Progress
-) -> tuple[dict[str, CameraAudit], Evidence | None]:
+def _measure_cameras(
+    data: Dataset, deployed: Rig, matcher: FullMatcher, tolerance: Array, *, config: Config,
+    watch: Stopwatch, progress: Progress,
+) -> tuple[dict[str, CameraAudit], Evidence | None]:  # fmt: skip
     """The audits of all cameras, and the evidence where every measurement can be trusted."""
-    evidence = gather_of_run(run, asks_guess=True)
-    doubts = _doubts(run, evidence, progress)
-    cameras = {
-        name: judge_camera(evidence, name, doubts[name], tolerance) for name in run.guess.cameras
-    }
+    try:
+        run = match_from_deployed(data, deployed, matcher, config, watch=watch, progress=progress)
+        with watch("places"):
+            run = assign_places(run)
+        run = refine_with_camera_pairs(run)
+        with watch("checks"):
+            evidence = gather_of_run(run, asks_guess=True)
+            doubts = _doubts(run, evidence, progress)
+            cameras = {
+                name: judge_camera(evidence, name, doubts[name], tolerance)
+                for name in deployed.cameras
+            }
+    except CorrespondenceError as error:
+        too_few_matches = error.camera in deployed.cameras and error.row is None
+        if not too_few_matches:  # a wrong table
+            raise
+        nothing = CameraAudit("CANNOT TELL", f"{error}; {SEARCHES_FARTHER}")
+        return dict.fromkeys(deployed.cameras, nothing), None
+    finally:
+        matcher.release()
     trusted = not any(doubts.values()) and all(each.sigma is not None for each in cameras.values())
     return cameras, evidence if trusted else None
 
@@ -186,7 +187,7 @@ def _judge_lidar(
     cameras: Mapping[str, CameraAudit],
     lidars: MeasuredLidars | None,
     tolerance: Array,
-) -> LidarAudit | None:
+) -> CameraAudit | None:
     """The motion of the LiDAR, of several the base, if one explains the deviations of all others.
 
     None where none is WRONG, or with a single one, which cannot be told from the LiDAR; and where

@@ -25,7 +25,7 @@ from calibgraph.audit.judgement import (
 )
 from calibgraph.audit.lidars import freedom_of_places
 from calibgraph.audit.model import Deviations, LimitsOf, compare, poses_of
-from calibgraph.audit.result import ORDER, CameraAudit, LidarAudit, lidar_summary
+from calibgraph.audit.result import ORDER, CameraAudit, lidar_summary
 from calibgraph.errors import CalibrationError
 from calibgraph.io.calibrations import load_calibration
 from calibgraph.model.calibration import Calibration
@@ -65,7 +65,7 @@ class Drift:
 
     results: tuple[str, ...]
     cameras: Mapping[str, tuple[CameraAudit, ...]]
-    lidar: tuple[LidarAudit | None, ...]
+    lidar: tuple[CameraAudit | None, ...]
     tolerance_deg: float
     tolerance_cm: float
     false_alarm_rate: float
@@ -260,7 +260,7 @@ def _lidar(
     judged: Mapping[str, tuple[CameraAudit, ...]],
     *,
     limits: LimitsOf,
-) -> LidarAudit | None:
+) -> CameraAudit | None:
     """The motion of the LiDAR that explains how all cameras of one result deviate."""
     rows = {name: int(np.flatnonzero(each.poses.results == place)[0])
             for name, each in compared.items() if place in each.poses.results}  # fmt: skip

@@ -20,10 +20,10 @@ from numpy.typing import ArrayLike
 from scipy.special import chdtri, fdtri, ndtri, stdtrit
 
 from calibgraph.arrays import Array, Mask
-from calibgraph.audit.result import CameraAudit, LidarAudit
+from calibgraph.audit.result import CameraAudit
 from calibgraph.model.error_sources import MATCHES, MOST_TIMES, ErrorSources
 from calibgraph.model.findings import UNKNOWN, MatcherFindings, error_components
-from calibgraph.model.geometry import to_T_lidar_camera, twist_between
+from calibgraph.model.geometry import twist_between
 from calibgraph.solver.covariance import ENOUGH_FRAMES, PSEUDO_FRAMES
 from calibgraph.tracking.cause import Steps, find_cause
 from calibgraph.trust.evidence import Evidence
@@ -191,7 +191,7 @@ def find_lidar_motion(
     *,
     moved: Collection[int],
     quantile: float,
-) -> LidarAudit | None:
+) -> CameraAudit | None:
     """The motion of the LiDAR, if one explains the deviations of all cameras; else None.
 
     A LiDAR beside it is a camera here.
@@ -211,14 +211,15 @@ def find_lidar_motion(
         step=deviation,
         covariance=covariance,
         limits=np.full(cameras, float(chdtri(6, FALSE_ALARM_RATE / cameras))),
-        T_lidar_camera=tuple(to_T_lidar_camera(T) for T in T_camera_lidar),
+        T_camera_lidar=np.array(T_camera_lidar),
     )
     lidar = find_cause(steps, moved).lidar
     if lidar is None:
         return None
     motion, sigma = -lidar[0], np.sqrt(np.diag(lidar[1]))
     clear = np.abs(motion) > quantile * sigma
-    return LidarAudit(describe_motion(motion, sigma, clear, LIDAR_AXES), motion, sigma)
+    reason = describe_motion(motion, sigma, clear, LIDAR_AXES)
+    return CameraAudit("WRONG", reason, motion, sigma)
 
 
 def describe_motion(motion: Array, sigma: Array, which: Mask, axes: tuple[str, ...]) -> str:

@@ -18,7 +18,10 @@ ORDER = ("OK", "CANNOT TELL", "CHANGED", "WRONG")
 
 @dataclass(frozen=True, eq=False)
 class CameraAudit:
-    """A camera's pose, or that of another LiDAR than the base, compared with another one of it.
+    """A camera's pose, or that of a LiDAR, compared with another one of it.
+
+    Of the base LiDAR, or the only one: its motion in its own axes, where it alone explains how all
+    other sensors deviate.
 
     Attributes:
         status: OK, CANNOT TELL, or what deviates: WRONG of ``check``, CHANGED of ``drift``.
@@ -54,22 +57,6 @@ class CameraAudit:
 
 
 @dataclass(frozen=True, eq=False)
-class LidarAudit:
-    """A motion of the LiDAR, which explains the deviations of all cameras.
-
-    Attributes:
-        reason: the motion in one sentence.
-        motion: (6,) xi in T_deployed_now = exp(xi), the pose of the LiDAR now in the LiDAR frame
-            as deployed: rotation [rad], translation [m].
-        sigma: (6,) standard deviations of ``motion``.
-    """
-
-    reason: str
-    motion: Array
-    sigma: Array
-
-
-@dataclass(frozen=True, eq=False)
 class Audit:
     """The audit of a rig.
 
@@ -89,7 +76,7 @@ class Audit:
     """
 
     cameras: Mapping[str, CameraAudit]
-    lidar: LidarAudit | None
+    lidar: CameraAudit | None
     deployed: Rig
     shown: Frame
     recording: tuple[str, ...]
@@ -168,9 +155,9 @@ def audit_summary(audit: Audit) -> dict[str, Any]:
     }
 
 
-def lidar_summary(lidar: LidarAudit) -> dict[str, Any]:
+def lidar_summary(lidar: CameraAudit) -> dict[str, Any]:
     """A motion of the LiDAR as plain values."""
-    twists = {**by_unit("motion", lidar.motion), **by_unit("sigma", lidar.sigma)}
+    twists = {**by_unit("motion", lidar.deviation), **by_unit("sigma", lidar.sigma)}
     return {"reason": lidar.reason, **twists}
 
 

@@ -1,4 +1,4 @@
-"""The commands report, evaluate, perturb, doctor, weights, export and simulate."""
+"""The commands report, evaluate, perturb, doctor, export and simulate."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 from dataclasses import asdict
 from pathlib import Path
 from shlex import join
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import typer
 from typer import Argument, Option
@@ -133,30 +133,6 @@ def doctor(
         raise typer.Exit(1)
 
 
-def weights(
-    file: Path = Argument(..., metavar="FILE", help="Weights, .tar or .safetensors."),
-    out: Path | None = Option(None, metavar="FILE", help="Convert to this .safetensors file."),
-    as_json: options.JsonOption = False,
-    force: options.Force = False,
-) -> None:
-    """Check a file of CMRNext weights, print what is in it, and convert it to safetensors."""
-    from calibgraph.files import require_new_file
-
-    if out is not None:
-        require_new_file(out, ".safetensors", force=force)
-    from calibgraph.matching.cmrnext import load_checkpoint
-
-    checkpoint = load_checkpoint(file)
-    if out is not None:
-        checkpoint.save_safetensors(out)
-    if as_json:
-        print_json(checkpoint.summary())
-    else:
-        from calibgraph.report.tables import print_weights
-
-        print_weights(terminal(), checkpoint.summary(), out)
-
-
 _FORMATS = "; ".join(f"{name}: {meaning}" for name, meaning in EXPORT_FORMATS.items()) + "."
 
 
@@ -240,64 +216,42 @@ def _parse_pose(text: str) -> NDArray[np.float64]:
 
 
 STREET = "street"
-RIG, BEAMS, STEP_M = "kitti", 64, 4.0  # defaults of simulate_street, but for the rig
-_PANEL = "Scenario street"
 
 
 def simulate(
     scenario: str = Argument(
         ...,
         metavar="SCENARIO",
-        help="street: a dataset of scans and images of a drive along a procedural street. "
-        "kitti, walkley: a table of correspondences, with the errors of the paper's matcher.",
+        help="street: a dataset of scans and images of a drive along a procedural street.",
     ),
     out: Path = Option(..., metavar="DIR", help="Folder to write."),
     frames: int = Option(10, help="Number of frames."),
     rotation_deg: float = Option(5.0, min=0, help="Rotation error of the guess, rig.yaml."),
     translation_m: float = Option(0.3, min=0, help="Translation error of the guess."),
     seed: options.Seed = 0,
-    rig: str | None = Option(
-        None,
+    rig: str = Option(
+        "kitti",
         metavar="NAME|RIG",
-        rich_help_panel=_PANEL,
         help="kitti, walkley (stereo pairs), surround (six cameras), fisheye (four), omni "
         "(two that see more than a half-space), sample (three small ones), or a rig file; its "
-        f"extrinsics are the truth. (default: {RIG})",
+        "extrinsics are the truth.",
     ),
-    beams: int | None = Option(
-        None,
-        metavar="16|32|64|128",
-        rich_help_panel=_PANEL,
-        help=f"Of the LiDAR. (default: {BEAMS})",
-    ),
-    step_m: float | None = Option(
-        None, rich_help_panel=_PANEL, help=f"Mean distance between frames. (default: {STEP_M:g})"
-    ),
+    beams: int = Option(64, metavar="16|32|64|128", help="Of the LiDAR."),
+    step_m: float = Option(4.0, help="Mean distance between frames."),
 ) -> None:
     """Simulate data with a known truth, reference.yaml, and a displaced guess, rig.yaml."""
     from calibgraph.io.rigs import load_rig
     from calibgraph.simulation.recording import simulate_street
     from calibgraph.simulation.rigs import RIG_NAMES, rig_of
-    from calibgraph.simulation.scenarios import SCENARIOS, simulate_table
 
-    common: dict[str, Any] = {
-        "frames": frames, "rotation_deg": rotation_deg, "translation_m": translation_m, "seed": seed
-    }  # fmt: skip
-    given: dict[str, Any] = {"rig": rig, "beams": beams, "step_m": step_m}
-    street = {name: value for name, value in given.items() if value is not None}
     with progress_bar() as progress, checked_arguments():
-        if scenario == STREET:
-            name = street.pop("rig", RIG)
-            is_file = name not in RIG_NAMES and name and Path(name).exists()
-            truth = load_rig(name) if is_file else rig_of(name)
-            written = simulate_street(out, truth, **street, **common, progress=progress)
-        elif street and scenario in SCENARIOS:
-            named = " and ".join(f"--{name.replace('_', '-')}" for name in street)
-            raise ValueError(
-                f"scenario {scenario!r} has its own rig and matcher, {named} would change nothing; "
-                f"leave it out, or simulate {STREET!r}"
-            )
-        else:
-            written = simulate_table(out, scenario, **common)
+        if scenario != STREET:
+            raise ValueError(f"unknown scenario {scenario!r}; known is {STREET}")
+        is_file = rig not in RIG_NAMES and rig and Path(rig).exists()
+        written = simulate_street(
+            out, load_rig(rig) if is_file else rig_of(rig), beams=beams, frames=frames,
+            step_m=step_m, seed=seed, rotation_deg=rotation_deg, translation_m=translation_m,
+            progress=progress,
+        )  # fmt: skip
     for path in written:
         print_line(f"{path}: written")

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import re
-import sys
 from dataclasses import replace
 from pathlib import Path
 from shlex import join
 from typing import TYPE_CHECKING, Any
 
-import typer
 from typer import Argument, Option
 
 from calibgraph.cli import options
@@ -53,7 +51,7 @@ def rig(
         metavar="[NAME=]HOW",
         help="Of a folder: how the lens of a camera, or of all, is known: calibration; a "
         "horizontal field of view, as '90 deg'; or focal length and size of a pixel, as "
-        "'4 mm 3 um'. May be repeated. (default: asked in a terminal, else calibration)",
+        "'4 mm 3 um'. May be repeated. (default: calibration)",
     ),
     forward: str = Option("+x", metavar="+x|-x|+y|-y", help="The LiDAR's axis ahead; z is up."),
     topic: options.Topic = None,
@@ -227,15 +225,9 @@ def _write_template(
 
 
 def _lenses(given: list[str] | None, cameras: list[str]) -> dict[str, str]:
-    """How the lens of each camera is known, as given for all or one, or asked for."""
-    from calibgraph.guessing.mounting import CALIBRATION, LENS_GRAMMAR
+    """How the lens of each camera is known, as given for all or one."""
+    from calibgraph.guessing.mounting import CALIBRATION
 
     for_all = [how for how in given or () if "=" not in how]
-    if not given and sys.stdin.isatty() and sys.stderr.isatty():
-        answers = [CALIBRATION]
-        for name in cameras:
-            question = f"{name}: how is its lens known? {LENS_GRAMMAR}"
-            answers.append(typer.prompt(question, default=answers[-1], err=True))
-        return dict(zip(cameras, answers[1:], strict=True))
     named = parse_names("--lens", [how for how in given or () if "=" in how])
     return dict.fromkeys(cameras, for_all[-1] if for_all else CALIBRATION) | named

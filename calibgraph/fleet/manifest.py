@@ -21,7 +21,7 @@ Key = tuple[str, str]
 """What a job is known by in the rows: vehicle, recordings."""
 _SEPARATOR = ";"  # between several recordings in one cell
 _OWN = ("vehicle", "recording", "rig", "settings")
-_MOST_BYTES, _MOST_SETTINGS_BYTES = 2**31, 2**20
+_MOST_BYTES = 2**31
 _MATCHING = ("frames", "search_deg", "search_m")
 
 
@@ -133,7 +133,7 @@ def _job(row: int, folder: str, *, vehicle: Any, recording: Any, rig: Any, setti
     """A row's job.
 
     Raises:
-        ValueError, FileError: naming the cell that is wrong, or the file of settings.
+        ValueError, FileError: naming the cell that is wrong.
     """
     if not isinstance(vehicle, str) or not vehicle:
         raise ValueError(f"vehicle {vehicle!r}: expected a name; give the column as text")
@@ -146,7 +146,7 @@ def _job(row: int, folder: str, *, vehicle: Any, recording: Any, rig: Any, setti
         raise ValueError(f"rig {rig!r}: expected a path or URI")
     recordings = tuple(join(folder, uri.strip()) for uri in found)
     place = join(folder, rig) if rig else None
-    job = Job(vehicle, recordings, place, _settings(folder, settings), row)
+    job = Job(vehicle, recordings, place, _settings(settings), row)
     if job.is_table and len(recordings) > 1:
         raise ValueError(f"vehicle {vehicle!r}: several tables; write them into one file")
     if job.is_table and not rig:
@@ -154,17 +154,11 @@ def _job(row: int, folder: str, *, vehicle: Any, recording: Any, rig: Any, setti
     return job
 
 
-def _settings(folder: str, cell: Any) -> Settings:
-    """Settings from the text of a mapping, or the URI of a YAML file."""
+def _settings(cell: Any) -> Settings:
+    """Settings from the text of a mapping."""
     if cell is not None and not isinstance(cell, str):
-        raise ValueError(f"settings {cell!r}: expected the text of a mapping, or a YAML file's URI")
-    text, where = cell or "{}", "settings"
-    if not text.lstrip().startswith("{"):
-        where = join(folder, text)
-        try:
-            text = read_bytes(where, _MOST_SETTINGS_BYTES).decode()
-        except UnicodeDecodeError as error:
-            raise FileError(where, f"is not a text file ({error.reason})") from error
-    content = parse_yaml(text, where)
+        raise ValueError(f"settings {cell!r}: expected the text of a mapping")
+    content = parse_yaml(cell or "{}", "settings")
     matching = {name: content.pop(name) for name in _MATCHING if name in content}
-    return checked_model(Settings, {**matching, "config": config_from(content, where)}, where)
+    given = {**matching, "config": config_from(content, "settings")}
+    return checked_model(Settings, given, "settings")

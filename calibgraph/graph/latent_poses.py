@@ -32,10 +32,6 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from calibgraph.arrays import Array
-from calibgraph.graph.by_place import (
-    BlockByPlace,
-    PairByPlace,
-)
 from calibgraph.graph.components import EXACT, VarianceComponents
 from calibgraph.graph.lens import LensTerm, lens_graph
 from calibgraph.graph.objective import join
@@ -54,10 +50,96 @@ from calibgraph.graph.variables import (
 from calibgraph.model.config import Reported
 from calibgraph.model.geometry import adjoints, retract_all
 from factors import (
+    BlockSums,
+    Columns,
+    PairBlock,
+    ProjectionBlock,
     displaced_between_factor,
     placed_factor,
     to_runs,
 )
+
+Numbers = NDArray[np.int64]
+
+
+def place_of(frame: Numbers, places: Sequence[Numbers]) -> Numbers:
+    """(n,) index of each frame's place; of a frame that is in none, any index.
+
+    Args:
+        frame: (n,) frame numbers.
+        places: the frame numbers of each place.
+    """
+    numbers = np.concatenate(places)
+    place = np.repeat(np.arange(len(places)), [len(frames) for frames in places])
+    order = np.argsort(numbers)
+    nearest = np.searchsorted(numbers, frame, sorter=order)
+    found: Numbers = place[order][np.minimum(nearest, len(numbers) - 1)]
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class BlockByPlace:
+    """One camera's correspondences, sorted by place.
+
+    Attributes:
+        block: with its loss and scale.
+        edges: (P + 1,) first row of each place, and the end.
+        place_of_frame: (f,) of the camera's frames, in their own order.
+        count_of_frame: (f,) of correspondences.
+        free: columns of lens and clock that are estimated; None: none.
+    """
+
+    block: ProjectionBlock
+    edges: Numbers
+    place_of_frame: Numbers
+    count_of_frame: Numbers
+    free: Columns | None = None
+
+    @property
+    def frames(self) -> Numbers:
+        """(P,) number of frames of each place."""
+        return np.bincount(self.place_of_frame, minlength=len(self.edges) - 1)
+
+    @cached_property
+    def places(self) -> Numbers:
+        """(p,) the places that have correspondences, in rising order."""
+        return np.flatnonzero(np.diff(self.edges))
+
+    def sums(self, T_camera_cloud: Array, values: Array | None = None) -> BlockSums:
+        """H, b and c of every place by pose and columns, stacked.
+
+        Args:
+            T_camera_cloud: (P, 4, 4) of all places.
+            values: (k,) of the columns.
+        """
+        return self.block.summarize(T_camera_cloud, to_runs(self.edges), self.free, values)
+
+    def factor(self, place: int, keys: Sequence[int]) -> gtsam.NonlinearFactor:
+        """The correspondences of one place, lossless, on cloud, camera and columns there."""
+        rows = np.arange(*self.edges[place : place + 2])
+        return placed_factor(keys, self.block.select(rows), self.free)
+
+
+@dataclass(frozen=True, eq=False)
+class PairByPlace:
+    """The matches between two cameras, sorted by place.
+
+    Attributes:
+        numbers: of both cameras.
+        block: the features.
+        places: (r,) the places that have features, in rising order.
+        edges: (r + 1,) first row of every such place, and the end.
+    """
+
+    numbers: tuple[int, int]
+    block: PairBlock
+    places: Numbers
+    edges: Numbers
+
+    @property
+    def keys(self) -> list[int]:
+        """Of ``n_a`` and ``n_b``."""
+        return [*map(paired_key, self.numbers)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,23 +214,13 @@ class LatentPoseModel:
     @cached_property
     def paired(self) -> list[int]:
         """Numbers of the cameras that are part of a pair."""
-        names = {name for pair in self.pairs for name in (pair.a, pair.b)}
-        return [number for number, name in enumerate(self.cameras) if name in names]
+        return sorted({number for pair in self.pairs for number in pair.numbers})
 
     @cached_property
     def is_distorted(self) -> bool:
         """Whether the scan distortion is a variable."""
         parts = self.components
         return bool(parts.distortion_jacobian.any() or parts.pair_distortion_jacobian.any())
-
-    @cached_property
-    def matched_places(self) -> list[tuple[int, int]]:
-        """Place and camera of every ``a_cp``."""
-        return [
-            (place, number)
-            for number in self.matched
-            for place in self.blocks[self.cameras[number]].places.tolist()
-        ]
 
     @cached_property
     def present(self) -> NDArray[np.bool_]:
@@ -158,15 +230,16 @@ class LatentPoseModel:
             found[row, self.blocks[self.cameras[number]].places] = True
         return found
 
+    @property
+    def matched_places(self) -> list[tuple[int, int]]:
+        """Place and camera of every ``a_cp``."""
+        return [(place, self.matched[row]) for row, place in np.argwhere(self.present).tolist()]
+
     @cached_property
     def shared_graph(self) -> gtsam.NonlinearFactorGraph:
         """The factors of what all places share: of errors, pose graph, lenses."""
-        return join(self.error_graph, self.pose_graph, self.lens_graph)
-
-    @cached_property
-    def lens_graph(self) -> gtsam.NonlinearFactorGraph:
-        """Those of lenses."""
-        return lens_graph(self.lenses, is_distorted=self.is_distorted)
+        lenses = lens_graph(self.lenses, is_distorted=self.is_distorted)
+        return join(self.error_graph, self.pose_graph, lenses)
 
     @cached_property
     def error_graph(self) -> gtsam.NonlinearFactorGraph:
@@ -205,55 +278,45 @@ class LatentPoseModel:
         """Keys of ``o`` and every ``m_c``."""
         return [CLOUD, *map(matched_key, self.matched)]
 
-    @property
-    def touched_keys(self) -> list[int]:
-        """Keys of the shared variables that factors of places have."""
-        return [*self.tied_keys, *map(paired_key, self.paired), *map(seen_lens_key, self.lenses)]
-
-    @cached_property
-    def shared_keys(self) -> list[int]:
-        """Keys of the variables that no place has of its own; the touched ones first."""
-        distortion = [DISTORTION] if self.is_distorted else []
-        return [
-            *self.touched_keys, *map(lens_key, self.lenses), *distortion, *self.camera_keys
-        ]  # fmt: skip
-
     @cached_property
     def columns(self) -> dict[int, NDArray[np.intp]]:
-        """By key of a shared variable, its columns among all of them."""
-        own = {DISTORTION: self.components.distortion_jacobian.shape[2]}
-        for number, term in self.lenses.items():
-            own[lens_key(number)] = own[seen_lens_key(number)] = len(term.variable.free)
-        sizes = [own.get(key, 6) for key in self.shared_keys]
-        parts = np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])
-        return dict(zip(self.shared_keys, parts, strict=True))
+        """By key of a shared variable, its columns; first those that factors of places have."""
+        sizes = dict.fromkeys([*self.tied_keys, *map(paired_key, self.paired)], 6)
+        for key in (seen_lens_key, lens_key):
+            sizes |= {key(n): len(term.variable.free) for n, term in self.lenses.items()}
+        if self.is_distorted:
+            sizes[DISTORTION] = self.components.distortion_jacobian.shape[2]
+        sizes |= dict.fromkeys(self.camera_keys, 6)
+        ends = np.cumsum([*sizes.values()]).tolist()
+        return {key: np.arange(end - sizes[key], end) for key, end in zip(sizes, ends, strict=True)}
 
-    def columns_of(self, keys: Sequence[int]) -> NDArray[np.intp]:
+    def columns_of(self, keys: Iterable[int]) -> NDArray[np.intp]:
         """The columns of some shared variables."""
         return np.concatenate([self.columns[key] for key in keys])
 
     @property
     def size(self) -> int:
-        """Number of these columns."""
-        return int(self.columns[self.shared_keys[-1]][-1]) + 1
+        """Number of these columns; those of the mounts are the last."""
+        return int(self.columns[self.camera_keys[-1]][-1]) + 1
 
     @cached_property
     def touched(self) -> int:
-        """Number of the columns of those that factors of places have; they are the first."""
-        return int(self.columns[self.touched_keys[-1]][-1]) + 1
+        """Number of the columns of those that factors of places have."""
+        of_lenses = sum(len(term.variable.free) for term in self.lenses.values())
+        return 6 * (len(self.tied_keys) + len(self.paired)) + of_lenses
 
     @cached_property
     def columns_of_matches(self) -> list[NDArray[np.intp]]:
         """Per matched camera, of o_p in front of all, m_c and s_c."""
-        keys = [[matched_key(n), *self.lens_keys(n)] for n in self.matched]
-        return [np.append(np.arange(6), 6 + self.columns_of(own)) for own in keys]
+        return [self._at_place([matched_key(n), *self.lens_keys(n)]) for n in self.matched]
 
     @cached_property
     def columns_of_pairs(self) -> list[NDArray[np.intp]]:
         """Per pair, of o_p in front of all, n_a and n_b."""
-        names = [(self.cameras.index(pair.a), self.cameras.index(pair.b)) for pair in self.pairs]
-        keys = [[paired_key(a), paired_key(b)] for a, b in names]
-        return [np.append(np.arange(6), 6 + self.columns_of(own)) for own in keys]
+        return [self._at_place(pair.keys) for pair in self.pairs]
+
+    def _at_place(self, keys: Iterable[int]) -> NDArray[np.intp]:
+        return np.append(np.arange(6), 6 + self.columns_of(keys))
 
 
 def latent_pose_graph(model: LatentPoseModel) -> gtsam.NonlinearFactorGraph:
@@ -275,10 +338,9 @@ def data_graph(model: LatentPoseModel) -> gtsam.NonlinearFactorGraph:
         keys = [cloud_at_key(place), matched_at_key(place, camera), *model.lens_keys(camera)]
         graph.add(model.blocks[model.cameras[camera]].factor(place, keys))
     for pair in model.pairs:
-        key_a, key_b = (paired_key(model.cameras.index(name)) for name in (pair.a, pair.b))
         for place, (first, end) in zip(pair.places.tolist(), to_runs(pair.edges), strict=True):
             features = pair.block.select(np.arange(first, end))
-            graph.add(placed_factor([cloud_at_key(place), key_a, key_b], features))
+            graph.add(placed_factor([cloud_at_key(place), *pair.keys], features))
     return graph
 
 

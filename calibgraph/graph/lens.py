@@ -167,12 +167,3 @@ def lens_graph(lenses: Mapping[int, LensTerm], *, is_distorted: bool) -> gtsam.N
         noise = gtsam.noiseModel.Gaussian.Covariance(term.excess + _EXACT**2 * unit)
         graph.add(linear_factor(keys, matrices, noise))
     return graph
-
-
-def start_lenses(lenses: Mapping[int, LensTerm]) -> gtsam.Values:
-    """Both variables of each lens, where correspondences have been weighed and gated."""
-    values = gtsam.Values()
-    for number, term in lenses.items():
-        for key in (lens_key(number), seen_lens_key(number)):
-            values.insert(key, term.variable.values)
-    return values

@@ -79,21 +79,14 @@ def _require_possible(value: Any, where: str) -> None:
         )
 
 
-def _of_poses(found: Array) -> Array:
-    if len(found) % _POSE:
-        raise ValueError(f"expected 6 rows for each pose, found {found.shape}")
-    return found
-
-
 def _of_one_pose(found: Array) -> Array:
-    if len(_of_poses(found)) != _POSE:
+    if len(found) != _POSE:
         raise ValueError(f"expected a 6x6 matrix, found {found.shape}")
     return found
 
 
-LensCovariance = Annotated[Any, BeforeValidator(covariance_matrix)]
-JointCovariance = Annotated[LensCovariance, AfterValidator(_of_poses)]
-Covariance = Annotated[LensCovariance, AfterValidator(_of_one_pose)]
+Matrix = Annotated[Any, BeforeValidator(covariance_matrix)]
+Covariance = Annotated[Matrix, AfterValidator(_of_one_pose)]
 
 
 class _Motion(BaseModel):
@@ -112,7 +105,7 @@ class _FrameEntry(BaseModel):
 
 class _JointOfLens(BaseModel):
     parameters: tuple[str, ...]
-    covariance: LensCovariance
+    covariance: Matrix
 
 
 def _without_former(settings: Any) -> Any:
@@ -129,7 +122,7 @@ class _Parts(BaseModel):
     initial_rig: Rig
     config: Annotated[Config, BeforeValidator(_without_former)]
     covariance: dict[str, Covariance | None]
-    joint_covariance: JointCovariance | None
+    joint_covariance: Matrix | None
     pair_covariance: dict[str, Covariance]
     stage1_T_camera_lidar: dict[str, Annotated[Any, BeforeValidator(rigid_transform)]]
     camera_verdicts: dict[str, Verdict]

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Callable, Iterator, Mapping
+from collections import UserDict
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cache, cached_property
@@ -41,30 +42,19 @@ PAIR_TANGENT_SENTENCE = (
 Value = TypeVar("Value")
 
 
-class Later(Mapping[str, Value]):
+class Later(UserDict[str, Value]):
     """Values by name, computed when they are first read; another process gets a dict."""
 
     def __init__(self, compute: Callable[[], Mapping[str, Value]]) -> None:
         self._compute = compute
 
     @cached_property
-    def _values(self) -> dict[str, Value]:
+    def data(self) -> dict[str, Value]:  # type: ignore[override]
+        """The values."""
         return dict(self._compute())
 
-    def __getitem__(self, name: str) -> Value:
-        return self._values[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._values)
-
-    def __len__(self) -> int:
-        return len(self._values)
-
-    def __repr__(self) -> str:
-        return repr(self._values)
-
     def __reduce__(self) -> tuple[Any, ...]:
-        return dict, (self._values,)
+        return dict, (self.data,)
 
 
 _PACKAGES = ("calibgraph", "gtsam", "numpy", "numba", "opencv-python-headless", "scipy")
@@ -277,7 +267,13 @@ class Calibration:
             moves = any(camera.time_offset_s or camera.readout_s for camera in cameras)
         else:
             moves = table.twist_per_s is not None
-        return left_out(self.config, self.rig, has_new_lens=bool(self.lens), motion_known=moves)
+        return left_out(
+            self.config,
+            self.rig,
+            has_new_lens=bool(self.lens),
+            motion_known=moves,
+            points_timed=table is not None and table.late_s is not None,
+        )
 
     def error_bar_holds(self, name: str) -> bool:
         """Whether the covariance of a camera or pair "A->B" describes its error.

@@ -68,7 +68,6 @@ CAUSES: dict[str, Cause] = {
         "belong to these images.",
         {
             "lens": "",
-            "values of the rig": "Correct the named value in the rig.",
             **{f"{by}{name}": "Check that intrinsics and image size belong to these images, or "
                f"estimate the lens: --estimate {part}."
                for by in ("lens_", "") for name, part in _ESTIMATED_AS.items()},

@@ -166,11 +166,6 @@ def relative_covariance(joint: Array, a: int, b: int, T_b_a: Array) -> Array:
     return covariance
 
 
-def adjoint_camera_lidar(T_lidar_camera: gtsam.Pose3) -> Array:
-    """(6, 6) Ad(T_lidar_camera^-1): a twist in the LiDAR frame to the same in the camera's."""
-    return np.asarray(T_lidar_camera.inverse().AdjointMap(), dtype=np.float64)
-
-
 def adjoints(T_a_b: Array) -> Array:
     """(f, 6, 6) Ad(T_a_b) of (f, 4, 4): twists in b, rotation first, to the same in a."""
     R, crosses = T_a_b[:, :3, :3], np.zeros((len(T_a_b), 3, 3))

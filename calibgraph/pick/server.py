@@ -27,7 +27,7 @@ from calibgraph.io.frame import Frame
 from calibgraph.io.rigs import REFERENCE_FILE
 from calibgraph.matching.structure.visibility import find_in_view, find_visible
 from calibgraph.model.geometry import degrees_and_centimetres
-from calibgraph.model.rig import Camera, Rig
+from calibgraph.model.rig import Camera
 from calibgraph.pick.estimate import (
     SESSION_FILE,
     CameraEstimate,
@@ -98,7 +98,7 @@ class Workspace:
         rig = reference_rig(self._estimate)
         table, reference = self.folder / TABLE_FILE, self.folder / REFERENCE_FILE
         to_table(self.session.pairs).save(table)
-        rig.save(reference, first_line="\n".join(_sigmas(rig)))
+        rig.save(reference)
         return [table, reference]
 
     def projected(self, index: int, name: str) -> NDArray[np.float32]:
@@ -152,18 +152,6 @@ def _answer(one: CameraEstimate, solved: Camera | None) -> dict[str, Any]:
                          for row in one.residuals_px.tolist()],
         "wrong": one.wrong,
     }  # fmt: skip
-
-
-def _sigmas(rig: Rig) -> list[str]:
-    """A comment per camera: its standard deviations, for people."""
-    lines = ["# standard deviations about and along the camera's x, y and z:"]
-    for name, camera in rig.cameras.items():
-        if camera.covariance is not None:
-            degrees, centimetres = degrees_and_centimetres(np.asarray(camera.covariance))
-            turn = " ".join(f"{value:.3f}" for value in degrees)
-            shift = " ".join(f"{value:.2f}" for value in centimetres)
-            lines.append(f"#   {json.dumps(name)}: {turn} deg, {shift} cm")
-    return lines
 
 
 MAX_BODY_BYTES = 2**20

@@ -28,6 +28,7 @@ from calibgraph.model.result_files import (
 )
 from calibgraph.model.verdict import Check, Direction, beside, in_unit, is_reachable
 from calibgraph.report.kit import page_template
+from calibgraph.report.lidar_views import draw_lidars
 from calibgraph.report.page_overlays import (
     depth_scale,
     draw_overlays,
@@ -35,7 +36,6 @@ from calibgraph.report.page_overlays import (
     write_overlays,
 )
 from calibgraph.report.plots import reprojection_errors, residual_map
-from calibgraph.solver.pairs import match_errors_px
 
 
 def write_report(result: Calibration, path: Path | str) -> Path:
@@ -78,11 +78,14 @@ def render_page(result: Calibration) -> str:
         for index, (name, camera) in enumerate(rig.cameras.items())
     ]
     lidars = [_lidar_row(result, name) for name in result.lidar_verdicts]
+    views, views_left_out = draw_lidars(result) if lidars else (None, "")
     summary = result.summary
     return page_template("calibgraph.report").render(
         result=result,
         cameras=cameras,
         lidars=lidars,
+        views=views,
+        views_left_out=views_left_out,
         summary=summary,
         recording=recording_name(result),
         places=describe_places(result.places) if result.places else "",
@@ -125,12 +128,11 @@ def _camera_pairs(result: Calibration) -> list[dict[str, Any]]:
         return rows
     for a, b in table.pairs():
         matches = table.of_pair(a, b)
-        errors_px = match_errors_px(result.rig, matches)
-        known, name = errors_px[~np.isnan(errors_px)], f"relative pose of {a} and {b} by images"
+        known = np.isfinite(matches.planes_lidar_per_m[:, :, 0]).any(axis=1)
+        name = f"relative pose of {a} and {b} by images"
         rows.append({
-            "name": f"{a}, {b}", "matches": len(matches), "surfaces": len(known),
+            "name": f"{a}, {b}", "matches": len(matches), "surfaces": int(known.sum()),
             "frames": len(np.unique(matches.frame)),
-            "median_px": f"{np.median(known):.2f}" if len(known) else "-",
             "check": next((c for c in result.camera_verdicts[a].checks if c.name == name), None),
         })  # fmt: skip
     return rows

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -52,8 +52,13 @@ def residual_map(camera: Camera, errors: ReprojectionErrors) -> tuple[str, float
     for start, end in np.rint(2**_SUBPIXEL_BITS * np.stack([starts, ends], axis=1)).astype(int):
         cv2.arrowedLine(image, start, end, _ARROW, 2, cv2.LINE_AA, _SUBPIXEL_BITS, 0.3)
     cv2.rectangle(image, (0, 0), (_WIDTH_PX - 1, height - 1), _FRAME)
+    return png_uri(image), factor
+
+
+def png_uri(image: NDArray[np.uint8]) -> str:
+    """A picture, BGR, as a PNG in a data URI."""
     _, data = cv2.imencode(".png", image)
-    return f"data:image/png;base64,{base64.b64encode(data.tobytes()).decode('ascii')}", factor
+    return f"data:image/png;base64,{base64.b64encode(data.tobytes()).decode('ascii')}"
 
 
 def _thin(dots: Array) -> Array:
@@ -108,20 +113,14 @@ class ReprojectionErrors:
     """The errors of one camera's preprocessed correspondences.
 
     Attributes:
-        points_lidar_m: (n, 3) in the LiDAR frame.
         pixels_px: (n, 2) matched pixels.
         vectors_px: (n, 2) projected less matched, along the directions that the match constrains:
             for an edge, across it. The gate compares its length.
-        distances_m: (n,) from the camera to the points.
-        frame: (n,) frame numbers.
         gate_px: tau of the result.
     """
 
-    points_lidar_m: Array
     pixels_px: Array
     vectors_px: Array
-    distances_m: Array
-    frame: NDArray[np.int64]
     gate_px: float
 
     @property
@@ -136,12 +135,7 @@ class ReprojectionErrors:
 
     def select(self, rows: NDArray[np.bool_]) -> ReprojectionErrors:
         """The errors of some correspondences."""
-        columns: dict[str, Any] = {
-            name: column[rows]
-            for name, column in vars(self).items()
-            if isinstance(column, np.ndarray)
-        }
-        return replace(self, **columns)
+        return replace(self, pixels_px=self.pixels_px[rows], vectors_px=self.vectors_px[rows])
 
 
 def reprojection_errors(result: Calibration) -> dict[str, ReprojectionErrors]:
@@ -167,13 +161,9 @@ def _errors_at(T_camera_lidar: Array, matches: CameraBlock, gate_px: float) -> R
     """The errors of those matches that project into the camera at this extrinsic."""
     block = matches.block
     residuals, valid = block.residuals(T_camera_lidar[None])
-    points_camera = block.points_lidar_m @ T_camera_lidar[:3, :3].T + T_camera_lidar[:3, 3]
     everything = ReprojectionErrors(
-        points_lidar_m=block.points_lidar_m,
         pixels_px=block.pixels_px,
         vectors_px=constrained(residuals, matches.information),
-        distances_m=np.linalg.norm(points_camera, axis=1),
-        frame=matches.frame,
         gate_px=gate_px,
     )
     return everything.select(valid)

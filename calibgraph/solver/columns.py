@@ -23,17 +23,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calibgraph.arrays import Array
-from calibgraph.graph.by_place import place_of
+from calibgraph.graph.latent_poses import place_of
 from calibgraph.graph.lens import LensVariable
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
-from calibgraph.model.geometry import adjoints, to_T_camera_lidar, transform
+from calibgraph.model.geometry import adjoints, transform
 from calibgraph.model.rig import Camera
 from calibgraph.solver.covariance import convex_hessian, with_pseudo_frames
 from calibgraph.solver.matches import CameraBlock, camera_block
@@ -245,7 +244,7 @@ class DistortionEvidence:
 def distortion_evidence(
     block: CameraBlock,
     scale: ResidualScale,
-    T_lidar_camera: gtsam.Pose3,
+    T_camera_lidar: Array,
     weak: Array,
     *,
     places: Sequence[Numbers],
@@ -259,7 +258,7 @@ def distortion_evidence(
     Args:
         block: inliers of one camera.
         scale: of their residuals.
-        T_lidar_camera: their minimum.
+        T_camera_lidar: (4, 4) their minimum.
         weak: (6 + k, 6 + k) information that is added to the Hessian, so that few matches have an
             inverse.
         places: the numbers of the frames of each place.
@@ -279,8 +278,7 @@ def distortion_evidence(
     values = np.zeros(len(free))
     values[: len(known)] = 0.0 if lens is None else lens.values
     squares = some.block.select(order).rescale(scale=math.inf, sigma=scale.sigma)
-    T = to_T_camera_lidar(T_lidar_camera)[None]
-    sums = squares.summarize(T, to_runs(edges), free, values)
+    sums = squares.summarize(T_camera_lidar[None], to_runs(edges), free, values)
     size = 6 + len(known)  # of what follows
     moves, bends = slice(size), slice(size, None)
     hessian = np.concatenate([sums.hessian, sums.hessian.sum(axis=0)[None]])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -114,6 +113,7 @@ def variance_components(
     shown: Mapping[str, tuple[WithinPlace, DistortionEvidence | None]],
     *,
     places: int,
+    rigid: tuple[Array, Array],
 ) -> VarianceComponents:
     """The prior components, but for the pairs' part of the scan distortion.
 
@@ -123,6 +123,7 @@ def variance_components(
         shown: per camera that has correspondences, what these share by the scatter of frames, and
             their quadratics in the scan distortion.
         places: number of places.
+        rigid: by :func:`common_error`.
     """
     prior, sigmas = error_components(), np.asarray(findings.bend_sigmas)
     at_place = np.tile(np.eye(6), (places, len(cameras), 1, 1))
@@ -139,10 +140,10 @@ def variance_components(
             information += weight * np.outer(sigmas, sigmas) * evidence.information
             vector += weight * sigmas * evidence.vector
     of_place = np.square([findings.place_rotation_rad, findings.place_translation_m])
-    components = VarianceComponents(
-        cloud=np.eye(6),
+    return VarianceComponents(
+        cloud=rigid[0],
         cloud_at_place=pose_covariance(*of_place),
-        camera=np.eye(6),
+        camera=rigid[1],
         pairs=pose_covariance(*(pair_sigmas()[[0, 3]] ** 2 / 2)),
         at_place=at_place,
         scatter_at_place=scatter_at_place,
@@ -152,19 +153,12 @@ def variance_components(
         distortion_vector=vector,
         robust_scale=prior.robust_sigmas if places >= prior.robust_places else np.inf,
     )
-    return common_error(components, findings.rigid_sigmas, findings.camera_share)
 
 
-def common_error(
-    components: VarianceComponents, sigmas: tuple[float, float], camera_share: float
-) -> VarianceComponents:
-    """The components with a rigid error that all frames share, of the cloud and of each camera."""
-    whole = np.square(sigmas)
-    return replace(
-        components,
-        cloud=pose_covariance(*((1.0 - camera_share) * whole)),
-        camera=pose_covariance(*(camera_share * whole)),
-    )
+def common_error(sigmas: tuple[float, float], camera_share: float) -> tuple[Array, Array]:
+    """(6, 6) covariances of the rigid error that all frames share: of cloud and camera."""
+    of_cloud, of_camera = np.outer([1.0 - camera_share, camera_share], np.square(sigmas))
+    return pose_covariance(*of_cloud), pose_covariance(*of_camera)
 
 
 def pose_covariance(rotation_rad2: float, translation_m2: float) -> Array:

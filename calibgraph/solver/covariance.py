@@ -12,7 +12,7 @@ import numpy as np
 from calibgraph.arrays import Array
 from calibgraph.graph.objective import pose_key
 from calibgraph.model.findings import error_components
-from calibgraph.model.geometry import pose_rows, to_T_lidar_camera
+from calibgraph.model.geometry import pose_rows
 from calibgraph.solver.two_pass import Objective, Scales, Transforms, to_values
 from factors import BlockSums, ProjectionBlock, to_runs
 
@@ -67,10 +67,6 @@ class FittedObjective:
     def cameras(self) -> tuple[str, ...]:
         """Their names, in the order of the extrinsics."""
         return tuple(self.T_camera_lidar)
-
-    def pose(self, camera: str) -> gtsam.Pose3:
-        """T_lidar_camera of a camera, the variable of the graph."""
-        return to_T_lidar_camera(self.T_camera_lidar[camera])
 
     @cached_property
     def projections(self) -> Mapping[str, ProjectionBlock]:

@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
-from calibgraph.graph.by_place import BlockByPlace
 from calibgraph.graph.components import VarianceRatios
-from calibgraph.graph.latent_poses import LatentPoseModel
+from calibgraph.graph.latent_poses import BlockByPlace, LatentPoseModel
 from calibgraph.graph.objective import join, pose_key
 from calibgraph.model.findings import UNKNOWN, MatcherFindings, error_components
 from calibgraph.model.geometry import (
@@ -206,9 +205,9 @@ def error_model(
         placed, evidence = replace(by_place, block=block_of_graph), None
         lens, number = inliers.lenses.get(name), cameras.index(name)
         if any(findings.bend_sigmas):
-            weak, pose = weak_information(lens), at.pose(name)
+            weak, T = weak_information(lens), at.T_camera_lidar[name]
             evidence = distortion_evidence(
-                block, at.scales[name], pose, weak, places=places, lens=lens
+                block, at.scales[name], T, weak, places=places, lens=lens
             )
         blocks[name] = placed
         if lens is not None:
@@ -220,21 +219,22 @@ def error_model(
             blocks[name] = replace(placed, free=lens.free)
         shown[name] = within, evidence
     pairs = [pair for pair in inliers.pairs if len(pair.frame)]  # the gate may leave none
-    components = variance_components(findings, cameras, shown, places=len(places))
+    rigid = common_error(findings.rigid_sigmas, findings.camera_share)
     if not any(findings.systematic_sigmas) and inliers.pairs:  # nothing is stated
         unknown = MatcherFindings(**error_components().matchers[UNKNOWN])
-        components = common_error(components, unknown.systematic_sigmas, unknown.camera_share)
+        rigid = common_error(unknown.systematic_sigmas, unknown.camera_share)
+    components = variance_components(findings, cameras, shown, places=len(places), rigid=rigid)
+    features = pairs_by_place(pairs, places, cameras)
     components = replace(
         components,
         pair_distortion_jacobian=pair_jacobians(
             components.distortion_jacobian,
             np.isin(cameras, list(inliers.blocks)),
             invert(np.stack([*at.T_camera_lidar.values()])),
-            sorted({(cameras.index(pair.a), cameras.index(pair.b)) for pair in pairs}),
+            sorted({pair.numbers for pair in features}),
         ),
     )
     graph = join(inliers.pose_graph, held_graph(cameras, at.T_camera_lidar, at.held))
-    features = pairs_by_place(pairs, places)
     of, errors = inliers.config.of, lens_errors(at)
     return LatentPoseModel(
         cameras, blocks, features, graph, components, of, lenses, errors, tuple(places)

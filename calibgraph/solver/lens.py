@@ -9,13 +9,14 @@ matches, S that by the scatter of frames, and k the variance that matches are le
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
+from dataclasses import replace
 
 import numpy as np
 from scipy.linalg import block_diag
 
 from calibgraph.arrays import Array
-from calibgraph.graph.by_place import BlockByPlace
 from calibgraph.graph.components import EXACT
+from calibgraph.graph.latent_poses import BlockByPlace
 from calibgraph.graph.lens import LensTerm, LensVariable
 from calibgraph.graph.variables import lens_key
 from calibgraph.model.config import LensPart, Reported
@@ -26,7 +27,7 @@ from calibgraph.model.rig import Camera, Rig
 from calibgraph.solver.covariance import FittedObjective, positive_part
 from calibgraph.solver.places import ErrorFit
 from calibgraph.solver.within_place import WEAK, WithinPlace
-from factors import ProjectionBlock, to_runs
+from factors import Columns, ProjectionBlock, to_runs
 from factors.columns import CENTRE_X, CENTRE_Y, FOCAL, OFFSET, READOUT
 
 Lenses = Mapping[str, LensVariable]
@@ -44,6 +45,8 @@ _SCENES = 0.7, 1.4  # times as far are the things of another recording: so stree
 _DEPTHS = 0.5, 1.0, 2.0  # of a scene, over its mean
 _SAMPLE, _DIRECTIONS_SEEN = 3000, 500  # at most, of the matches, and of their directions
 _NEAREST_M = 0.1  # added to distances, whose logarithms are taken
+_TRAVEL = np.diag([0.0, 0.0, 0.1, 10.0, 10.0, 0.0])[2:5]
+"""Of a vehicle on a street, standard deviations of turns [rad/s] and speeds [m/s], z upwards."""
 _DIRECTIONS = "pitch", "yaw", "roll", "x", "y", "z"
 _UNITS = {FOCAL: "px", CENTRE_X: "px", CENTRE_Y: "px", OFFSET: "s", READOUT: "s"}
 
@@ -126,13 +129,31 @@ def lens_errors(at: FittedObjective) -> dict[int, Array]:
     return found
 
 
+def travel_errors(at: FittedObjective) -> Array:
+    """(6 N, 3) of all poses, by a standard deviation of each unknown motion of the vehicle.
+
+    In the tangents of T_lidar_camera. Where clouds were swept while it drove, and are not
+    corrected, every pose makes up for the way between points and pixels: all by the same motion.
+    """
+    found = np.zeros((len(at.cameras), 6, len(_TRAVEL)))
+    for name, block in at.projections.items():
+        if block.motion is None or block.motion[:, :6].any():
+            continue  # of one instant, or moved to the time of the pixels
+        shift, T = Columns(block.lens, (OFFSET,), (1.0,)), at.T_camera_lidar[name][None]
+        for column, twist in zip(found[at.cameras.index(name)].T, _TRAVEL, strict=True):
+            of_unit = np.column_stack([np.outer(block.motion[:, 6], twist), np.zeros(len(block))])
+            hessian = replace(block, motion=of_unit).summarize(T, None, shift).hessian[0]
+            column[:] = np.linalg.solve(hessian[:6, :6] + WEAK, hessian[:6, 6])
+    return found.reshape(-1, len(_TRAVEL))
+
+
 def considered_lens(camera: Camera, block: ProjectionBlock) -> LensVariable:
     """What may err of a lens, as the rig states or as of a calibrated camera.
 
     And of the clock, where the motion of the LiDAR is known.
     """
     parts: list[LensPart] = [*_LENS]
-    if block.motion is not None:
+    if block.motion is not None and block.motion[:, :6].any():
         parts += ["offset", "readout"] if camera.readout_sigma_s else ["offset"]
     return LensVariable.of(camera, parts, LensSigmas.calibrated(camera))
 
@@ -220,86 +241,52 @@ def moved_lenses(lenses: Lenses, fit: ErrorFit | None) -> tuple[Lenses, float]:
     moved, largest = {**lenses}, 0.0
     for number in fit.model.lenses:
         name, key = fit.model.cameras[number], lens_key(number)
-        values, sigmas = (
-            fit.linear.shared.atVector(key),
-            np.sqrt(np.diag(fit.linear.covariance_of([key]))),
-        )
+        values = fit.linear.shared.atVector(key)
+        sigmas = np.sqrt(np.diag(fit.linear.covariance_of([key])))
         moved[name] = lenses[name].moved_to(values)
         largest = max(largest, float((abs(values - lenses[name].values) / sigmas).max()))
     return moved, largest
 
 
-def lens_estimates(fit: ErrorFit) -> dict[str, tuple[LensEstimate, ...]]:
-    """Per camera whose lens is free, its parameters with their marginal."""
-    model, found = fit.model, {}
-    for number, term in model.lenses.items():
-        values, covariance = (
-            fit.linear.shared.atVector(lens_key(number)),
-            joint_of_lens(fit, number),
-        )
-        sigmas = np.sqrt(np.diag(covariance))
-        with_pose = np.abs(covariance / np.outer(sigmas, sigmas))[6:, :6]
-        rows = zip(term.variable.free.parameters, sigmas[6:], with_pose, strict=True)
-        found[model.cameras[number]] = tuple(
-            _estimate(term.variable, values, name, sigma, correlations=correlations)
-            for name, sigma, correlations in rows
-        )
-    return found
+def lens_estimates(fit: ErrorFit) -> tuple[dict[str, tuple[LensEstimate, ...]], dict[str, Array]]:
+    """Per camera whose lens is free, its parameters; and the marginal of pose, lens and clock.
 
-
-def joint_of_lens(fit: ErrorFit, number: int) -> Array:
-    """(6 + k, 6 + k) covariance of a camera's reported pose and its lens, in their tangents."""
-    own, lens = pose_rows(number), fit.model.columns[lens_key(number)]
-    rows = np.vstack([fit.rows[own], np.eye(fit.model.size)[lens]])
-    joint = rows @ fit.linear.joint_covariance @ rows.T
-    joint[:6, :6] = fit.covariance[own, own]
-    return np.asarray(joint)
-
-
-def lens_covariances(fit: ErrorFit) -> dict[str, Array]:
-    """Per camera whose lens is free, the (6 + k, 6 + k) joint marginal of pose, lens and clock.
-
-    Of xi in T_camera_lidar = exp(xi) estimate, then of the parameters in the order and the units of
-    :func:`lens_estimates`.
+    That is (6 + k, 6 + k), of xi in T_camera_lidar = exp(xi) estimate, then of the parameters in
+    their order and units.
     """
-    model, found = fit.model, {}
+    model, estimates, joints = fit.model, dict[str, tuple[LensEstimate, ...]](), {}
     for number, term in model.lenses.items():
-        joint = joint_of_lens(fit, number)
-        units = [_unit(term.variable, name) for name in term.variable.free.parameters]
-        scale = np.array([-1.0] * 6 + units)  # of T_lidar_camera the tangent is -xi
-        found[model.cameras[number]] = joint * np.outer(scale, scale)
-    return found
+        own, key, name = pose_rows(number), lens_key(number), model.cameras[number]
+        lens, values = term.variable, fit.linear.shared.atVector(key)
+        before, after = (_in_units(lens, at) for at in (np.zeros(len(values)), values))
+        is_focal = np.equal(lens.free.parameters, FOCAL)
+        units = np.where(is_focal, before, 1.0) * lens.free.sigmas
+        rows = np.vstack([fit.rows[own], np.eye(model.size)[model.columns[key]]])
+        joint = rows @ fit.linear.joint_covariance @ rows.T
+        joint[:6, :6] = fit.covariance[own, own]
+        scale = np.append(np.full(6, -1.0), units)  # of T_lidar_camera the tangent is -xi
+        joints[name] = joint * np.outer(scale, scale)
+        sigmas = np.sqrt(np.diag(joints[name]))
+        with_pose = np.abs(joints[name] / np.outer(sigmas, sigmas))[6:, :6]
+        estimates[name] = tuple(
+            LensEstimate(
+                name=parameter,
+                unit=_UNITS.get(parameter, ""),
+                value=float(after[row]),
+                sigma=float(sigmas[6 + row]),
+                prior=float(before[row]),
+                prior_sigma=float(units[row]),
+                direction=_DIRECTIONS[int(with_pose[row].argmax())],
+                correlation=float(with_pose[row].max()),
+            )
+            for row, parameter in enumerate(lens.free.parameters)
+        )
+    return estimates, joints
 
 
-def _estimate(
-    lens: LensVariable, values: Array, name: str, sigma: float, *, correlations: Array
-) -> LensEstimate:
-    """One parameter, with standard deviation and correlation with the pose of its camera."""
-    most, unit = int(np.argmax(correlations)), _unit(lens, name)
-    before, after = (_in_its_unit(lens, name, v) for v in (np.zeros(len(values)), values))
-    return LensEstimate(
-        name=name,
-        unit=_UNITS.get(name, ""),
-        value=after,
-        sigma=float(sigma * unit),
-        prior=before,
-        prior_sigma=float(unit),
-        direction=_DIRECTIONS[most],
-        correlation=float(correlations[most]),
-    )
-
-
-def _unit(lens: LensVariable, name: str) -> float:
-    """The prior standard deviation of a parameter, in its unit."""
-    step = lens.free.sigmas[lens.free.parameters.index(name)]
-    of_rig = _in_its_unit(lens, name, np.zeros(len(lens.free)))
-    return step * of_rig if name == FOCAL else step
-
-
-def _in_its_unit(lens: LensVariable, name: str, values: Array) -> float:
-    """A parameter at some values, as people state it."""
-    camera, clock = lens.put_into(lens.camera, values), lens.free.clock_at(values)
-    k = camera.intrinsics_px
+def _in_units(lens: LensVariable, values: Array) -> Array:
+    """The parameters at some values, as people state them."""
+    k, clock = lens.put_into(lens.camera, values).intrinsics_px, lens.free.clock_at(values)
     known = {
         OFFSET: clock.offset_s,
         READOUT: clock.readout_s,
@@ -307,4 +294,5 @@ def _in_its_unit(lens: LensVariable, name: str, values: Array) -> float:
         CENTRE_X: k.cx,
         CENTRE_Y: k.cy,
     }
-    return known[name] if name in known else lens.free.coefficient(name, values)
+    names = lens.free.parameters
+    return np.array([known[n] if n in known else lens.free.coefficient(n, values) for n in names])

@@ -27,12 +27,13 @@ from calibgraph.solver.pairs import (
     rows_of_pair,
     usual_excess,
 )
+from calibgraph.solver.places import lengthen
 from calibgraph.solver.pnp import DAMPING
-from calibgraph.solver.two_pass import Objective, Optimum
+from calibgraph.solver.two_pass import RELATIVE_TOLERANCE, Objective, Optimum
 from factors import pose_sigmas
 
 _NARROWINGS = 3  # steps at most from the spread at the estimate to the least one, by half each
-_COARSE = 1e-6  # relative change of the error at which each of them stops
+_COARSE = 1e-5  # relative change of the error at which each of them stops
 _MAX_STEPS, _MAX_STEP, _CONVERGED = 30, 0.1, 1e-5  # of a pair alone: rad, m
 _SETTLED, _MOST = 0.005, 9  # relative change of a spread that ends its measuring, and its steps
 Places = Mapping[frozenset[str], Mapping[str, Array]]
@@ -71,7 +72,9 @@ def refine_with_pairs(
         T = near.minimize(T, at.scales, tolerance=_COARSE).T_camera_lidar
     kept = [t.without_outliers(T, s) for t, s in zip(scaled, sigmas.tolist(), strict=True)]
     joined = inliers.with_pairs(kept)
-    return joined, joined.minimize(T, at.scales)
+    goes_on = inliers.config.preset == "auto"  # to the optimum of the error model
+    tolerance = _COARSE if goes_on else RELATIVE_TOLERANCE
+    return joined, joined.minimize(T, at.scales, tolerance=tolerance)
 
 
 def place_pairs(terms: Sequence[PairTerm], T_camera_lidar: Mapping[str, Array]) -> Places:
@@ -118,6 +121,8 @@ def fit_pair(
     T, held = np.stack([(near or start)[name] for name in names]), np.linalg.pinv(covariance_a)
     prior, rows = np.zeros((12, 12)), [rows_of_pair(names, term) for term in terms]
     prior[:6, :6], sigmas, stands = held, np.zeros(len(terms)), False
+    reach, slope = 1.0, 0.0
+    step: Array = np.zeros(12)
     for number in range(_MAX_STEPS):
         now, data, gradient = dict(zip(names, T, strict=True)), np.zeros((12, 12)), np.zeros(12)
         if not stands:
@@ -131,9 +136,13 @@ def fit_pair(
             gradient[own] += sums.gradient
         gradient[:6] += held @ local_coordinates(start[names[0]], invert(T[:1]))[0]
         hessian = prior + data
-        step = -np.linalg.solve(hessian + DAMPING * np.diag(np.diag(hessian)), gradient)
-        step *= min(1.0, _MAX_STEP / np.abs(step).max())
-        T = retract_all(T, np.asarray(step.reshape(2, 6)))
+        reach = lengthen(reach, float(gradient @ step) / slope) if slope else 1.0
+        step = -np.asarray(
+            np.linalg.solve(hessian + DAMPING * np.diag(np.diag(hessian)), gradient), np.float64
+        )
+        step *= min(reach, _MAX_STEP / np.abs(step).max())
+        slope = float(gradient @ step) if stands else 0.0
+        T = retract_all(T, step.reshape(2, 6))
         if np.abs(step).max() < _CONVERGED:
             break
     covariance = np.linalg.pinv(prior + data / usual_excess(terms), hermitian=True)

@@ -154,25 +154,6 @@ def pair_graph(terms: Iterable[PairTerm], keys: Mapping[str, int]) -> gtsam.Nonl
     return graph
 
 
-def match_errors_px(rig: Rig, table: CameraMatches) -> Array:
-    """(n,) residual of each match at the rig's extrinsics, the larger of both sides.
-
-    NaN where neither side has a surface; infinite where the other camera cannot see the point.
-    """
-    errors = np.full(len(table), np.nan)
-    for a, b in table.pairs():
-        numbers = [table.cameras.index(name) for name in (a, b)]
-        of_pair = (table.camera_index == numbers).all(axis=1)
-        for side, names in enumerate(((a, b), (b, a))):
-            there = of_pair & np.isfinite(table.planes_lidar_per_m[:, side, 0])
-            rays = unproject(rig.cameras[names[0]].lens, table.pixels_px[there, side])[0]
-            planes, pixels = table.planes_lidar_per_m[there, side], table.pixels_px[there, 1 - side]
-            block = PairBlock.of_surfaces(rig.cameras[names[1]].lens, rays, planes, pixels)
-            values = PairTerm(*names, block, table.frame[there]).errors_px(rig.T_camera_lidar)
-            errors[there] = np.fmax(errors[there], values)
-    return errors
-
-
 def _term_of_side(rig: Rig, names: tuple[str, str], side: int, rows: CameraMatches) -> PairTerm:
     """The features of one side with their surfaces, predicted in the other camera."""
     a, b = (rig.cameras[name] for name in names)

@@ -30,13 +30,14 @@ import numpy as np
 from calibgraph.arrays import Array
 from calibgraph.graph.components import VarianceRatios
 from calibgraph.graph.latent_poses import LatentPoseModel, right_jacobians, to_ordering
-from calibgraph.graph.lens import start_lenses
 from calibgraph.graph.variables import (
     CLOUD,
     DISTORTION,
     camera_key,
+    lens_key,
     matched_key,
     paired_key,
+    seen_lens_key,
 )
 from calibgraph.model.geometry import (
     adjoints,
@@ -56,6 +57,7 @@ TOLERANCE = 1e-6
 _FREE = 1e3  # rad and m: a standard deviation that no correspondences have
 _SHARES = 0.5 ** np.arange(12)
 """Of a step: the first that descends; mostly the whole step."""
+_FARTHEST, _LEAST = 2.5, 0.1  # steps at once, where the slope shows that it pays
 
 
 class Ties(NamedTuple):
@@ -192,8 +194,7 @@ class Linearization:
         """The sums of every pair by place, in the tangents of o_p, n_a and n_b: (r, 18, 18)."""
         found = []
         for pair in self.model.pairs:
-            numbers = [self.model.cameras.index(name) for name in (pair.a, pair.b)]
-            shown = _poses(self.shared, map(paired_key, numbers))
+            shown = _poses(self.shared, pair.keys)
             seen = self.inverses[0, pair.places] @ shown[:, None]
             sums = pair.block.run_sums(seen[0], seen[1], pair.edges)
             by_cloud = -adjoints(invert_each(seen.reshape(-1, 4, 4))).reshape(2, -1, 6, 6)
@@ -280,7 +281,7 @@ class Linearization:
         """(n, n) and (n,) gradient of linear factors of shared variables."""
         n, present = self.model.size, {*factors.keys()}
         hessian, gradient = np.zeros((n, n)), np.zeros(n)
-        keys = [key for key in self.model.shared_keys if key in present]
+        keys = [key for key in self.model.columns if key in present]
         own, at = factors.hessian(to_ordering(keys)), self.model.columns_of(keys)
         hessian[np.ix_(at, at)], gradient[at] = own[0], -own[1]
         return hessian, gradient
@@ -306,15 +307,22 @@ class Linearization:
         """Twice GTSAM's error."""
         of_data = float(sum(sums.cost.sum() for sums in (self.data, *self.pairs)))
         ties = self.ties.cost(self.model.components.robust_scale)
-        return of_data + ties + 2.0 * self.model.shared_graph.error(self.shared)
+        if self.model.lenses:  # whose priors are robust
+            return of_data + ties + 2.0 * self.model.shared_graph.error(self.shared)
+        return of_data + ties + 2.0 * self.shared_factors.error(self.shared.zeroVectors())
+
+    @cached_property
+    def gradient(self) -> Array:
+        """(n,) by the shared variables, places eliminated."""
+        gradient, own = self.shared_hessian[1].copy(), self.places.gradient.sum(axis=0)
+        gradient[: len(own)] += own
+        return gradient
 
     @cached_property
     def step(self) -> Array:
         """(n,) of the shared variables, by Gauss-Newton."""
-        gradient, own = self.shared_hessian[1].copy(), self.places.gradient.sum(axis=0)
-        gradient[: len(own)] += own
         scaled, units = unit_diagonal(self.hessian())
-        return -np.asarray(np.linalg.solve(scaled, gradient / units)) / units
+        return -np.asarray(np.linalg.solve(scaled, self.gradient / units)) / units
 
     def moved(self, share: float) -> Linearization:
         """The graph after a part of the step."""
@@ -328,14 +336,6 @@ class Linearization:
         moved = retract_all(self.inverses.reshape(-1, 4, 4), steps.reshape(-1, 6))
         shared = self.shared.retract(of_shared)
         return Linearization(model, shared, moved.reshape(self.inverses.shape))
-
-    def descend(self) -> Linearization | None:
-        """The graph after a step, shortened until it descends; None if no step does."""
-        for share in _SHARES:
-            tried = self.moved(share)
-            if tried.cost <= self.cost:
-                return tried
-        return None
 
     def is_determined(self) -> bool:
         """Whether every direction of every camera is: of a free one rounding leaves far more."""
@@ -473,35 +473,45 @@ def fit_latent_poses(
         relative_tolerance: relative change of the cost at which it stops.
     """
     present = start if start.model is model else start.with_model(model)
-    change = np.inf
+    change, reach = np.inf, 1.0
     for _ in range(MAX_ITERATIONS):
         try:
-            found = present.descend()
+            tried = ((share, present.moved(share)) for share in (reach, *_SHARES))
+            lower = ((share, each) for share, each in tried if each.cost <= present.cost)
+            share, found = next(lower, (0.0, present))
         except np.linalg.LinAlgError:
             return None
-        if found is None:  # this is the minimum, to rounding
+        if not share:  # this is the minimum, to rounding
             return ErrorFit(present, 0.0)
         change = (present.cost - found.cost) / max(present.cost, np.finfo(float).tiny)
-        present = found
         if change <= relative_tolerance:
-            break
+            return ErrorFit(found, change)
+        before, left = (float(each.gradient @ present.step) for each in (present, found))
+        reach, present = lengthen(share, left / before), found
     return ErrorFit(present, change)
+
+
+def lengthen(share: float, left: float) -> float:
+    """The next step's length, where the last of this length has left so much of the slope.
+
+    A robust loss is flatter than its weights say, so that Gauss-Newton falls short.
+    """
+    return float(np.clip(share / max(1.0 - left, _LEAST), 1.0, _FARTHEST))
 
 
 def start_values(model: LatentPoseModel, T_camera_lidar: Mapping[str, Array]) -> Linearization:
     """All poses of a camera at its (4, 4) extrinsic, the cloud and lenses where they are."""
-    shared, T = start_lenses(model.lenses), [T_camera_lidar[name] for name in model.cameras]
-    poses = [*map(to_T_lidar_camera, T)]
-    for of, numbers in (
-        (camera_key, range(len(poses))),
-        (matched_key, model.matched),
-        (paired_key, model.paired),
-    ):
-        for number in numbers:
-            shared.insert(of(number), poses[number])
+    shared, T = gtsam.Values(), [T_camera_lidar[name] for name in model.cameras]
+    for number, pose in enumerate(map(to_T_lidar_camera, T)):
+        for key in (camera_key(number), matched_key(number), paired_key(number)):
+            if key in model.columns:
+                shared.insert(key, pose)
+    for number, term in model.lenses.items():
+        for key in (lens_key(number), seen_lens_key(number)):
+            shared.insert(key, term.variable.values)
     shared.insert(CLOUD, gtsam.Pose3())
     if model.is_distorted:
-        shared.insert(DISTORTION, np.zeros(model.components.distortion_jacobian.shape[2]))
+        shared.insert(DISTORTION, np.zeros(len(model.columns[DISTORTION])))
     each = np.array([np.eye(4), *(T[number] for number in model.matched)])
     return Linearization(model, shared, np.tile(each[:, None], (1, model.places, 1, 1)))
 

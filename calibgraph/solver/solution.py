@@ -29,7 +29,7 @@ from calibgraph.solver.error_model import (
     fit_without_priors,
     relative_pose_conflict,
 )
-from calibgraph.solver.lens import lens_covariances, lens_estimates, moved_lenses, put_into
+from calibgraph.solver.lens import lens_estimates, moved_lenses, put_into, travel_errors
 from calibgraph.solver.pair_refinement import (
     PairFit,
     Places,
@@ -106,15 +106,19 @@ class Solution:
         lenses, _ = moved_lenses(self.inliers.lenses, self.errors)
         return put_into(self.rig.moved_to(self.T_camera_lidar), lenses)
 
+    @cached_property
+    def _lenses(self) -> tuple[dict[str, tuple[LensEstimate, ...]], dict[str, Array]]:
+        return ({}, {}) if self.errors is None else lens_estimates(self.errors)
+
     @property
     def lens(self) -> dict[str, tuple[LensEstimate, ...]]:
         """Per camera whose lens is estimated, its parameters."""
-        return {} if self.errors is None else lens_estimates(self.errors)
+        return self._lenses[0]
 
     @property
     def lens_covariance(self) -> dict[str, Array]:
         """Per camera whose lens is estimated, (6 + k, 6 + k) of pose, lens and clock."""
-        return {} if self.errors is None else lens_covariances(self.errors)
+        return {name: joint.copy() for name, joint in self._lenses[1].items()}
 
     @cached_property
     def error_fit(self) -> ErrorFit | None:
@@ -139,6 +143,15 @@ class Solution:
         """
         return None if self.error_fit is None else self.error_fit.covariance
 
+    @cached_property
+    def travel(self) -> Array:
+        """(6 N, 3) what a drive does to poses whose clouds are not corrected for its motion.
+
+        By one standard deviation of each motion. It is no part of ``covariance``: the images of
+        this drive show these poses.
+        """
+        return travel_errors(self.fitted)
+
     @property
     def mount(self) -> ErrorFit | None:
         """The fit of the mounts, between which images and measurements show relative poses."""
@@ -156,7 +169,9 @@ class Solution:
         Args:
             joint: (6 N, 6 N) the reported covariance, which may be wider than that of the matches.
         """
-        return {} if self.error_fit is None else error_sources(self.error_fit, joint, self.held)
+        if self.error_fit is None:
+            return {}
+        return error_sources(self.error_fit, joint, self.travel, self.held)
 
     @cached_property
     def pair_terms(self) -> tuple[PairTerm, ...]:

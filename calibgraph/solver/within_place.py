@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
-from calibgraph.graph.by_place import BlockByPlace, PairByPlace, place_of
+from calibgraph.graph.latent_poses import BlockByPlace, PairByPlace, place_of
 from calibgraph.model.findings import error_components
 from calibgraph.solver.covariance import FittedObjective, convex_hessian, with_pseudo_frames
 from calibgraph.solver.matches import CameraBlock
@@ -173,7 +173,9 @@ def block_by_place(
     return BlockByPlace(block, edges.cumsum(), of_frame, counts)
 
 
-def pairs_by_place(pairs: Sequence[PairTerm], places: Sequence[Numbers]) -> list[PairByPlace]:
+def pairs_by_place(
+    pairs: Sequence[PairTerm], places: Sequence[Numbers], cameras: Sequence[str]
+) -> list[PairByPlace]:
     """Each term with the information of features that err as usual in a frame."""
     found = []
     for pair in pairs:
@@ -183,5 +185,6 @@ def pairs_by_place(pairs: Sequence[PairTerm], places: Sequence[Numbers]) -> list
         present, first = np.unique(of_row[rows], return_index=True)
         edges = np.append(first, len(rows))
         block = pair.block.with_variance(usual_excess(own)).select(rows)
-        found.append(PairByPlace(pair.a, pair.b, block, present, edges))
+        numbers = cameras.index(pair.a), cameras.index(pair.b)
+        found.append(PairByPlace(numbers, block, present, edges))
     return found

@@ -9,7 +9,6 @@ import numpy as np
 from calibgraph.arrays import Array
 from calibgraph.errors import CorrespondenceError
 from calibgraph.model.correspondences import Correspondences, concatenate
-from calibgraph.model.geometry import to_T_lidar_camera
 from calibgraph.model.rig import Rig
 from calibgraph.pipeline import solve
 from calibgraph.solver.columns import distortion_evidence
@@ -302,8 +301,8 @@ def _bends_of(state: State, camera: int, matches: CameraBlock) -> Array:
     for number, row in zip(numbers.tolist(), np.searchsorted(state.numbers, numbers), strict=True):
         at.setdefault(state.at[row], []).append(number)
     places = [np.array(of_place, dtype=np.int64) for of_place in at.values()]
-    pose = to_T_lidar_camera(state.references[camera])
-    one = distortion_evidence(matches, state.scales[camera], pose, WEAK, places=places)
+    T = state.references[camera]
+    one = distortion_evidence(matches, state.scales[camera], T, WEAK, places=places)
     parts = one.hessian, one.hessian @ one.jacobian, one.information, one.vector
     return np.concatenate([part.ravel() for part in parts])
 

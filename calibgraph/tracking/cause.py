@@ -11,16 +11,14 @@ up to. Each is compared with the one before: what lasts longer is a move or a dr
 
 from __future__ import annotations
 
-import math
 from collections.abc import Collection
 from dataclasses import dataclass
 
-import gtsam
 import numpy as np
 from scipy.special import chdtri, fdtri
 
 from calibgraph.arrays import Array
-from calibgraph.model.geometry import adjoint_camera_lidar, pose_rows
+from calibgraph.model.geometry import adjoints, pose_rows
 
 ALARM_CHANCE = 1e-8
 """Probability that one test of a camera that has not moved raises an alarm."""
@@ -55,14 +53,19 @@ class Steps:
         step: (6 n,) tangent steps of T_lidar_camera.
         covariance: (6 n, 6 n).
         limits: (n,) squared sigmas beyond which a camera has moved.
-        T_lidar_camera: before.
+        T_camera_lidar: (n, 4, 4) before.
     """
 
     cameras: tuple[int, ...]
     step: Array
     covariance: Array
     limits: Array
-    T_lidar_camera: tuple[gtsam.Pose3, ...]
+    T_camera_lidar: Array
+
+    @property
+    def by_lidar(self) -> Array:
+        """(6 n, 6) derivative of all cameras' steps by a step of the LiDAR."""
+        return adjoints(self.T_camera_lidar).reshape(-1, _POSE)
 
     def of(self, place: int) -> tuple[Array, Array]:
         """(6,) step and (6, 6) covariance of the camera at that place of ``cameras``."""
@@ -102,7 +105,8 @@ def find_cause(steps: Steps, found_by: Collection[int] = ()) -> Cause:
     if not moved or len(steps.cameras) == 1:
         return alone
     left, left_by_camera = unexplained(steps)
-    if left < _others_limit(steps) and left < left_by_camera - CLEARLY:
+    of_others = float(np.sort(steps.limits)[1:].sum())
+    if left < min(of_others, left_by_camera - CLEARLY):
         return Cause(steps.cameras, _lidar_step(steps))
     return alone
 
@@ -110,19 +114,14 @@ def find_cause(steps: Steps, found_by: Collection[int] = ()) -> Cause:
 def unexplained(steps: Steps) -> tuple[float, float]:
     """Squared sigmas that are left by a move of the LiDAR, and by one of the best camera."""
     step, _ = _lidar_step(steps)
-    by_lidar = squared_sigmas(steps.step - _by_lidar(steps) @ step, steps.covariance)
+    by_lidar = squared_sigmas(steps.step - steps.by_lidar @ step, steps.covariance)
     places = range(len(steps.cameras))
     return by_lidar, min(_left_by_camera(steps, place) for place in places)
 
 
-def _by_lidar(steps: Steps) -> Array:
-    """(6 n, 6) Jacobian of all cameras' steps with respect to a step of the LiDAR."""
-    return np.vstack([adjoint_camera_lidar(T) for T in steps.T_lidar_camera])
-
-
 def _lidar_step(steps: Steps) -> tuple[Array, Array]:
     """(6,) log(D) of the LiDAR's move that explains the steps best, and its (6, 6) covariance."""
-    design = _by_lidar(steps)
+    design = steps.by_lidar
     whitened = np.linalg.solve(steps.covariance, design)
     covariance: Array = np.asarray(np.linalg.inv(design.T @ whitened), dtype=np.float64)
     return covariance @ (whitened.T @ steps.step), covariance
@@ -133,11 +132,6 @@ def _left_by_camera(steps: Steps, place: int) -> float:
     rows = np.ones(len(steps.step), dtype=np.bool_)
     rows[pose_rows(place)] = False
     return squared_sigmas(steps.step[rows], steps.covariance[np.ix_(rows, rows)])
-
-
-def _others_limit(steps: Steps) -> float:
-    """Squared sigmas that one move of the LiDAR may leave unexplained."""
-    return float(np.sort(steps.limits)[1:].sum())
 
 
 def squared_sigmas(step: Array, covariance: Array) -> float:
@@ -167,13 +161,7 @@ def add_epoch(group: Array, score: Array, frames: float, noise: Array) -> Array:
 def inflation(group: Array) -> float:
     """Ratio of the epochs' scatter to that of their frames, on average; at least 1.
 
-    For alarms: after few epochs it has little bias.
+    After few epochs it has little bias.
     """
     epochs, squared = group.tolist()
     return max(1.0, squared / epochs) if epochs else 1.0
-
-
-def sure_inflation(group: Array) -> float:
-    """The lower end of the 2-sigma interval of the inflation, for the error bar."""
-    epochs = max(float(group[0]), 1.0)
-    return max(1.0, inflation(group) * (1 - 2 * math.sqrt(2 / (_POSE * epochs))))

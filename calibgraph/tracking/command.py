@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import signal
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -26,6 +27,7 @@ Notify = Callable[[str], None]
 
 STATE_FOLDER = "state"
 _TOGETHER = 50  # frames of a table that are taken in by one write
+_COUNTS = {"updates": "updates", "left out": "left out", "known": "known from before"}
 
 
 def track(
@@ -62,82 +64,62 @@ def track(
         if calibrator.resumed:
             notify(f"going on after frame {calibrator.tracker.frame}")
         gc.freeze()  # what is loaded by now stays: each full collection would visit it, for 0.1 s
-        run = Run(calibrator, notify)
         with calibrator:
-            run.follow(items, 1 if waits else _TOGETHER, stop)
-            if calibrator.tracker.frame is None and not stop.received:
-                held = f"held no frame that could be used ({run.left_out} left out); check it"
+            given = iter(lambda: stop.next_of(items, 1 if waits else _TOGETHER), [])
+            counts = _follow(calibrator, given, notify)
+            last = calibrator.tracker.frame
+            if last is None and not stop.received:
+                held = f"held no frame that could be used ({counts['left out']} left out); check it"
                 raise FileError("standard input" if waits else source, held)
             result = _result(calibrator.tracker, state)
-    run.report_counts()
+    notify(", ".join(f"{counts[key]} {text}" for key, text in _COUNTS.items()))
+    if counts["known"] and not counts["updates"]:
+        found = f"no frame comes after {last}"
+        notify(f"warning: {found}; if that number is wrong, choose another --out")
     return result, [result.save(out)]
 
 
-@dataclass
-class Run:
-    """Frames in, updates out, and what became of the frames.
+def _follow(
+    calibrator: DurableCalibrator, given: Iterator[list[Item]], notify: Notify
+) -> Counter[str]:
+    """Update with each frame until there are no more; counts of frames.
 
-    Attributes:
+    Each update is printed once it is on disk; after a crash, those of the last write come first,
+    since they may not have been printed. A reader that goes away ends the run.
+
+    Args:
         calibrator: takes the frames in.
+        given: the frames, those of one write together.
         notify: called with warnings and events as sentences.
-        updates: frames taken in.
-        left_out: input that was not a frame, or a frame that was left out.
-        skipped: frames at the beginning that an earlier run had taken in already.
     """
+    known = calibrator.tracker.frame if calibrator.resumed else None
+    counts = Counter[str]()
+    try:
+        _report(calibrator.repeated, notify)
+        for some in given:
+            errors = [one for one in some if isinstance(one, CalibrationError)]
+            right = [one for one in some if not isinstance(one, CalibrationError)]
+            frames = [one for one in right if known is None or one.frame > known]
+            if len(frames) < len(right) and not counts["known"]:
+                notify(f"frame {right[0].frame} and others up to {known} are known: skipped")
+            counts["known"] += len(right) - len(frames)
+            for found in [*errors, *calibrator.update_all(frames)]:
+                if isinstance(found, CalibrationError):
+                    counts["left out"] += 1
+                    notify(f"left out: {found}")
+                else:
+                    counts["updates"] += len(found)
+                    _report(found, notify)
+    except BrokenPipeError:
+        notify("stopped: the reader of standard output is gone; all updates are on disk")
+    return counts
 
-    calibrator: DurableCalibrator
-    notify: Notify
-    updates: int = 0
-    left_out: int = 0
-    skipped: int = 0
 
-    def follow(self, items: Iterator[Item], together: int, stop: Stop) -> None:
-        """Update with each frame until there are no more, or a signal has come.
-
-        Each update is printed once it is on disk; after a crash, those of the last write come
-        first, since they may not have been printed. A reader that goes away ends the run.
-
-        Args:
-            items: the frames.
-            together: how many are taken in by one write, if they are at hand.
-            stop: interrupts the wait for the next frame.
-        """
-        known = self.calibrator.tracker.frame if self.calibrator.resumed else None
-        try:
-            self._report(self.calibrator.repeated)
-            while some := stop.next_of(items, together):
-                errors = [one for one in some if isinstance(one, CalibrationError)]
-                given = [one for one in some if not isinstance(one, CalibrationError)]
-                frames = [one for one in given if known is None or one.frame > known]
-                if len(frames) < len(given) and not self.skipped:
-                    self.notify(
-                        f"frame {given[0].frame} and others up to {known} are known: skipped"
-                    )
-                self.skipped += len(given) - len(frames)
-                for found in [*errors, *self.calibrator.update_all(frames)]:
-                    if isinstance(found, CalibrationError):
-                        self.left_out += 1
-                        self.notify(f"left out: {found}")
-                    else:
-                        self.updates += len(found)
-                        self._report(found)
-        except BrokenPipeError:
-            self.notify("stopped: the reader of standard output is gone; all updates are on disk")
-
-    def report_counts(self) -> None:
-        """Notify of what became of the frames."""
-        self.notify(
-            f"{self.updates} updates, {self.left_out} left out, {self.skipped} known from before"
-        )
-        if self.skipped and not self.updates:
-            found = f"no frame comes after {self.calibrator.tracker.frame}"
-            self.notify(f"warning: {found}; if that number is wrong, choose another --out")
-
-    def _report(self, updates: Sequence[Update]) -> None:
-        for update, line in zip(updates, json_lines(updates), strict=True):
-            print_line(line)
-            for event in update.events:
-                self.notify(f"frame {event.detected_frame}: {event}")
+def _report(updates: Sequence[Update], notify: Notify) -> None:
+    for update, line in zip(updates, json_lines(updates), strict=True):
+        print_line(line)
+        for event in update.events:
+            notify(f"frame {event.detected_frame}: {event}")
 
 
 def _result(tracker: IncrementalCalibrator, state: Path) -> Calibration:

@@ -2,8 +2,7 @@
 
 An SQLite database has the state in its first row, then the inputs since. With a write-ahead log and
 ``synchronous=FULL``, rows are on disk when their transaction returns, and a crash leaves all of it
-or none. Rows are numbered, so that a missing one is noticed; what they hold has a checksum of its
-own (``calibgraph.tracking.state_bytes``).
+or none. What rows hold has a checksum of its own (``calibgraph.tracking.state_bytes``).
 """
 
 from __future__ import annotations
@@ -13,7 +12,6 @@ import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 from calibgraph.errors import CorrespondenceError, FileError
@@ -147,16 +145,8 @@ class DurableCalibrator:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        if kind is None:
-            self.close()
-        else:
-            self.abandon()
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        self.close() if kind is None else self.abandon()
 
 
 def _require_same(folder: Path, tracker: IncrementalCalibrator, rig: Rig, config: Config) -> None:
@@ -242,12 +232,11 @@ class StateDatabase:
         contents, execute = [*inputs], self._connection.execute
         try:
             execute("BEGIN")
-            (last,) = execute("SELECT max(number) FROM kept").fetchone()
             if state is not None:
                 execute("DELETE FROM kept")
                 contents.insert(0, state)
-            rows = enumerate(contents, 0 if last is None else last + 1)
-            self._connection.executemany("INSERT INTO kept VALUES (?, ?)", rows)
+            rows = ((content,) for content in contents)
+            self._connection.executemany("INSERT INTO kept (content) VALUES (?)", rows)
             execute("COMMIT")
         except BaseException as error:
             self.close()  # whether it is on disk is unknown
@@ -271,15 +260,12 @@ class StateDatabase:
         """
         try:
             (state,) = self._connection.execute("PRAGMA integrity_check(1)").fetchone()
-            rows = self._connection.execute("SELECT * FROM kept ORDER BY number").fetchall()
+            rows = self._connection.execute("SELECT content FROM kept ORDER BY number").fetchall()
         except sqlite3.Error as error:
             raise self._unusable(error) from error
         if state != "ok":
             raise _damaged(self._path, state)
-        for expected, (number, content) in enumerate(rows, rows[0][0] if rows else 0):
-            if number != expected or not isinstance(content, bytes):
-                raise _damaged(self._path, f"row {expected} is missing")
-        return [content for _, content in rows]
+        return [content for (content,) in rows]
 
     def _is_new(self) -> bool:
         """Whether there is nothing yet; the database of another is refused before it is changed."""

@@ -5,13 +5,17 @@ from __future__ import annotations
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.model.geometry import invert_each, local_coordinates, retract_all, to_T_lidar_camera
+from calibgraph.model.geometry import (
+    invert_each,
+    retract_all,
+    to_T_lidar_camera,
+)
 from calibgraph.solver.robust import median_norm, robust_spread, scale_from
 from calibgraph.solver.within_place import WEAK
 from calibgraph.tracking.absorption import add_to_totals, count_epoch
 from calibgraph.tracking.estimate import EpochGraph, locate_places
 from calibgraph.tracking.events import Event
-from calibgraph.tracking.gate import Gated, frame_sums
+from calibgraph.tracking.gate import Gated, sums_of
 from calibgraph.tracking.moves import report_drift, select_walk, shift_between, update_evidence
 from calibgraph.tracking.state import STRENGTHS, State
 from calibgraph.tracking.sums import Numbers, Sums
@@ -117,32 +121,28 @@ def _regate(state: State, camera: int, places: Numbers) -> None:
         least = max(robust_spread(sizes), raw.least_spread)
         scale = scale_from(robust_spread(sizes_px), least, state.config)
     within = sizes_px * median_norm(raw.information) <= scale.gate_px
-    gated = Gated(
-        poses[-1], raw, within, np.add.reduceat(within, raw.frame_edges[:-1], dtype=float)
-    )
+    starts = raw.frame_edges[:-1]
+    gated = Gated(poses[-1:], raw, within, np.add.reduceat(within, starts, dtype=float))
     state.put(camera, scales=scale, share=gated.usual_share)
     newest = gated.select(epochs == epochs[-1]) if state.walk[camera] else gated
     if newest.enough.any():
         state.put(camera, curvature=newest.curvature(scale))
     within = np.where(np.repeat(gated.enough, frames), within, own[1])
-    counts = np.add.reduceat(within, raw.frame_edges[:-1], dtype=np.int64)
-    steps = _linearized_at(state, camera, epochs, places[rows])
-    poses = retract_all(np.tile(state.references[camera], (len(steps), 1, 1)), steps)
-    runs = to_runs(np.concatenate([[0], counts.cumsum()]))
-    here = raw.with_scale(scale).select(within).summarize(poses, runs)
-    sums = frame_sums(here, state.curvature[camera], -steps, counts.astype(np.float64))
+    counts = np.add.reduceat(within, starts, dtype=float)
+    poses = _linearized_at(state, camera, epochs, places[rows])
     state.put(camera, blocks=(raw,), inliers=(within,))
+    sums = sums_of(state, {camera: Gated(poses, raw, within, counts)})
     state.sums = state.sums.replace_at((rows, camera), sums)
 
 
 def _linearized_at(state: State, camera: int, epochs: Numbers, places: Numbers) -> Array:
-    """(f, 6) steps from a camera's reference to where the matches of frames are linearized."""
+    """(f, 4, 4) T_camera_lidar at which the matches of frames are linearized."""
     if state.walk[camera]:
-        poses = invert_each(state.poses[epochs, camera])
-        return local_coordinates(state.references[camera], poses)
-    if state.config.preset != "auto":  # Eq. 5 knows no places
-        return np.zeros((len(epochs), 6))
-    return np.concatenate([state.steps[:, camera], np.zeros((1, 6))])[places]
+        return np.asarray(state.poses[epochs, camera])
+    steps = np.zeros((len(epochs), 6))
+    if state.config.preset == "auto":  # Eq. 5 knows no places
+        steps = np.concatenate([state.steps[:, camera], steps[:1]])[places]
+    return retract_all(np.tile(state.references[camera], (len(steps), 1, 1)), steps)
 
 
 # The summary of older epochs.

@@ -15,11 +15,11 @@ import gtsam
 import numpy as np
 
 from calibgraph.arrays import Array, Mask
-from calibgraph.graph.components import VarianceComponents, VarianceRatios, least_cost_of_distortion
+from calibgraph.graph.components import VarianceComponents, least_cost_of_distortion
 from calibgraph.graph.latent_poses import LatentPoseModel
 from calibgraph.graph.objective import objective_graph
 from calibgraph.model.findings import error_components
-from calibgraph.model.geometry import pose_rows, retract_all
+from calibgraph.model.geometry import retract_all
 from calibgraph.model.rig import RelativePose
 from calibgraph.solver.components import (
     Component,
@@ -36,13 +36,11 @@ from calibgraph.solver.within_place import (
     relative_covariance,
     split_excess,
 )
-from calibgraph.tracking.cause import sure_inflation
 from calibgraph.tracking.eliminate import Eliminated, block_diagonal, eliminate
-from calibgraph.tracking.state import Spread, State, rows_of
+from calibgraph.tracking.state import State, rows_of
 from calibgraph.tracking.sums import Numbers, PlaceSums, Sums
 from calibgraph.tracking.window import Window
 
-_PRIOR_FRAMES = 10.0  # weight of the scatter of all frames so far, while a moved camera has few
 _EXACT = 1e-4  # rad and m: what is stated of places to be smaller counts as nothing
 _ROUNDING = 1e-7  # rad and m: a pose that is shared more exactly makes the graph lose digits
 _SETTLED = 50.0  # frames of a camera: an epoch more hardly changes their scatter
@@ -50,21 +48,51 @@ _ROUNDS = 2  # of estimates of the variance ratios, a fit after each
 _OPEN_WEIGHINGS, _MOST_WEIGHINGS, _SAME_WEIGHT = 2, 20, 1e-2
 
 
+@dataclass(frozen=True, eq=False)
+class Spread:
+    """What the frames of each camera show of their errors, as ``calibgraph.solver.within_place``.
+
+    Attributes:
+        least: (n,) k, variance of matches of what they do not share, over that of independent ones.
+        excess: (n, 6, 6) K - k.
+        efficiency: (n,) of independent matches: their true variance over that of H, in the mean.
+    """
+
+    least: Array
+    excess: Array
+    efficiency: Array
+
+    @staticmethod
+    def unknown(cameras: int) -> Spread:
+        """Of independent matches."""
+        excess = np.tile(1e-3 * np.eye(6), (cameras, 1, 1))
+        return Spread(np.ones(cameras), excess, np.ones(cameras))
+
+    def mean_variance(self, place_variance: float, alike: Array) -> Array:
+        """(n,) of all matches of a camera, in units of independent ones, in the mean over a pose.
+
+        Args:
+            place_variance: of the matcher.
+            alike: (n,) frames of a place.
+        """
+        within = self.least + np.trace(self.excess, axis1=1, axis2=2) / 6
+        return np.asarray(within + place_variance * self.efficiency * alike)
+
+
 def spread_of(state: State, sums: PlaceSums) -> Spread:
     """What the frames of each camera show of their errors, about the means of their places.
 
-    With an allowance for few frames, as in a batch. While a camera that has moved has few frames,
-    the scatter is shrunk towards that of all its frames so far. Where the matcher states nothing of
-    places it is wider if epochs scatter more than their frames suggest.
+    With an allowance for few frames, as in a batch. Where the matcher states nothing of places it
+    is wider if epochs scatter more than their frames suggest.
     """
     (scatter, left), every = sums.within_places, sums.rows.total()
     hessian, reweighted, frames = every.hessian, every.reweighted, every.frames
     blank = Spread.unknown(len(frames))
     least, excess, efficiency = blank.least, blank.excess, blank.efficiency
     for camera in map(int, np.flatnonzero(frames)):
-        own = _usual_while_few(state, camera, scatter[camera], frames[camera])
+        own = scatter[camera]
         if not states_places(state) and state.scatter_of_frames(camera) is not None:
-            own = own * sure_inflation(state.groups[camera])
+            own = own * state.inflation(camera)
         true = hessian[camera] + WEAK
         own = allow_for_few_frames(
             own, true, left[camera], frames=frames[camera], matches=every.matches[camera]
@@ -73,15 +101,6 @@ def spread_of(state: State, sums: PlaceSums) -> Spread:
         covariance, efficiency[camera] = relative_covariance(own, root, true)
         least[camera], excess[camera] = split_excess(covariance)
     return Spread(least, excess, efficiency)
-
-
-def _usual_while_few(state: State, camera: int, scatter: Array, frames: float) -> Array:
-    """(6, 6) scatter of a camera's frames, that of all before counted in after a move."""
-    if state.moved_at[camera] < 0 or state.walk[camera]:
-        return scatter
-    share, rows = _PRIOR_FRAMES / (frames + _PRIOR_FRAMES), pose_rows(camera)
-    usual = state.total[rows, rows] * (frames / max(state.total_frames[camera], 1.0))
-    return np.asarray((1.0 - share) * scatter + share * usual)
 
 
 def states_places(state: State) -> bool:
@@ -241,7 +260,7 @@ class EpochGraph:
         self.places = closed_places(state)
         frames = self.places.frames.sum(axis=0)
         self._is_settled = bool((frames[state.started] >= _SETTLED).all())
-        self.spread = state.spread
+        self.spread = spread_of(state, self.places)
         self.pose_graph = pose_priors(state)
         T = dict(zip(state.names, state.references, strict=True))
         self.prior = pose_equations(self.pose_graph, state.names, T)
@@ -283,6 +302,7 @@ class EpochGraph:
             weights = own.open_weights(state, self.window.adjoint)
             found = own.eliminate(weights, self.window.adjoint)
             information, vector = information + found.information, vector + found.vector
+            self._open = own, weights, found
         self.window.exchange(information, vector)
         T, covariance = self.window.reported(state.config.of)
         if state.config.preset != "auto":
@@ -324,11 +344,9 @@ class EpochGraph:
 
         And (n, 4, 4) T_camera_lidar there.
         """
-        estimate = self.solve(state)
-        own = self.open_places(state, every_place(state, self.places, estimate.sums))
+        self.solve(state)
+        own, weights, found = self._open
         row, shown = own.names.index(state.at[-1]), self.window.shown
-        weights = own.open_weights(state, self.window.adjoint)
-        found = own.eliminate(weights, self.window.adjoint)
         u, v = own.apart(found, shown, weights)
         steps = shown + v[row] - (self.window.adjoint @ u[row])
         return own.squared(u, v)[row], retract_all(state.references, steps)
@@ -376,10 +394,11 @@ class EpochGraph:
             shown = np.outer(sigmas, sigmas) * (weight @ bends[:, 54:63]).reshape(size, size)
             vector = sigmas * (weight @ bends[:, 63:])
         each = np.tile(np.eye(6), (1, n, 1, 1))
+        cloud, camera = common_error(findings.rigid_sigmas, findings.camera_share)
         components = VarianceComponents(
-            cloud=np.eye(6),
+            cloud=shared * cloud,
             cloud_at_place=np.eye(6),
-            camera=np.eye(6),
+            camera=shared * camera,
             pairs=np.eye(6),
             at_place=each,
             scatter_at_place=each,
@@ -387,9 +406,8 @@ class EpochGraph:
             pair_distortion_jacobian=np.zeros_like(jacobian),
             distortion_information=shown,
             distortion_vector=vector,
+            distortion_size=shared,
         )
-        prior = common_error(components, findings.rigid_sigmas, findings.camera_share)
-        components = VarianceRatios(shared=shared).scale(prior)
         return SharedModel(state.names, {}, (), self.pose_graph, components, state.config.of)
 
 
@@ -447,7 +465,6 @@ def every_place(state: State, closed: PlaceSums, sums: Sums) -> PlaceSums:
 
 def settle(state: State) -> EpochGraph:
     """Find optimum, weights and variance ratios of the closed epochs; the graph with these."""
-    state.spread = spread_of(state, closed_places(state))
     graph = EpochGraph(state)
     rows = np.flatnonzero(graph.places.frames.any(axis=1)).tolist()
     shows_ratios = len(rows) > 1 or bool(len(rows) and state.rig.relative_poses)

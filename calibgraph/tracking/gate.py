@@ -29,16 +29,16 @@ _CURVATURES = 0.3, 1.0
 
 @dataclass(frozen=True, eq=False)
 class Gated:
-    """Frames of a camera, gated at one T_camera_lidar.
+    """Frames of a camera, and which of their matches are within the gate.
 
     Attributes:
-        T_camera_lidar: (4, 4).
+        poses: (1, 4, 4) T_camera_lidar, or (f, 4, 4) of each, where they are linearized.
         raw: all their matches.
         inliers: (m,) which of them are within the gate.
         counts: (f,) how many are, in each frame.
     """
 
-    T_camera_lidar: Array
+    poses: Array
     raw: CameraBlock
     inliers: Mask
     counts: Array
@@ -48,7 +48,7 @@ class Gated:
         """Gate all matches of some frames."""
         inliers = raw.within_gate(T_camera_lidar, scale.gate_px)
         counts = np.add.reduceat(inliers, raw.frame_edges[:-1], dtype=np.float64)
-        return Gated(T_camera_lidar, raw, inliers, counts)
+        return Gated(T_camera_lidar[None], raw, inliers, counts)
 
     @property
     def usual_share(self) -> float:
@@ -71,7 +71,7 @@ class Gated:
             return self
         rows = np.flatnonzero(np.repeat(frames, self.raw.frame_counts))
         raw = self.raw.select(rows)
-        return Gated(self.T_camera_lidar, raw, self.inliers[rows], self.counts[frames])
+        return Gated(self.poses, raw, self.inliers[rows], self.counts[frames])
 
     def curvature(self, scale: ResidualScale) -> Array:
         """(6, 6) M: with the Hessian by weights L L^T, the true one is L M L^T, of all inliers.
@@ -80,61 +80,46 @@ class Gated:
         """
         runs = np.array([[0, int(self.counts.sum())]])
         block = self.raw.with_scale(scale).select(self.inliers)
-        here = block.summarize(self.T_camera_lidar[None], runs, curvature=True)
+        here = block.summarize(self.poses, runs, curvature=True)
         assert here.curvature is not None
-        true = here.curvature[0] + self.raw.gate_hessian(self.T_camera_lidar, scale)
+        true = here.curvature[0] + self.raw.gate_hessian(self.poses[0], scale)
         inverse = np.linalg.inv(np.linalg.cholesky(here.hessian[0] + WEAK))
         values, vectors = np.linalg.eigh(inverse @ true @ inverse.T)
         return np.asarray((vectors * np.clip(values, *_CURVATURES)) @ vectors.T)
 
 
-def sums_of(state: State, gated: Mapping[int, Gated], *, together: bool = False) -> Sums:
+def sums_of(state: State, gated: Mapping[int, Gated]) -> Sums:
     """(f,) sums of the inliers in the frames of each camera in turn, about its reference.
-
-    Args:
-        state: with the scales of the residuals, and how curved their cost is.
-        gated: by camera; linearized where they are gated.
-        together: whether all frames of a camera are one.
-    """
-    parts, counts, cameras = [], [], list[int]()
-    for camera, one in gated.items():
-        own = np.array([one.counts.sum()]) if together else one.counts
-        edges = np.concatenate([[0], own.cumsum().astype(np.int64)])
-        block = one.raw.with_scale(state.scales[camera]).select(one.inliers)
-        parts.append(block.summarize(one.T_camera_lidar[None], to_runs(edges)))
-        counts.append(own)
-        cameras += [camera] * len(own)
-    at, to = np.array([one.T_camera_lidar for one in gated.values()]), state.references[[*gated]]
-    steps = np.zeros((len(at), 6))
-    if not np.array_equal(at, to):
-        steps = logarithms(at @ invert_each(to))
-    step = steps.repeat([*map(len, counts)], axis=0)
-    return frame_sums(BlockSums.join(parts), state.curvature[cameras], step, np.concatenate(counts))
-
-
-def frame_sums(here: BlockSums, curvature: Array, steps: Array, matches: Array) -> Sums:
-    """(f,) sums of frames about a reference.
 
     The true Hessian of few matches is noise, and may not be definite: its ratio to the one by
     weights is that of all frames.
 
     Args:
-        here: where they are linearized.
-        curvature: (6, 6), or (f, 6, 6), M of :meth:`Gated.curvature`.
-        steps: (f, 6) from there to the reference.
-        matches: (f,) how many.
+        state: with the scales of the residuals, and how curved their cost is.
+        gated: by camera; linearized at its poses.
     """
+    parts, at, cameras = [], [], list[int]()
+    for camera, one in gated.items():
+        edges = np.concatenate([[0], one.counts.cumsum().astype(np.int64)])
+        block = one.raw.with_scale(state.scales[camera]).select(one.inliers)
+        parts.append(block.summarize(one.poses, to_runs(edges)))
+        at.append(np.broadcast_to(one.poses, (len(one.counts), 4, 4)))
+        cameras += [camera] * len(one.counts)
+    here, poses, to = BlockSums.join(parts), np.concatenate(at), state.references
     root = np.linalg.cholesky(here.hessian + WEAK)
-    hessian = root @ curvature @ root.swapaxes(1, 2)
-    gradient = here.gradient + (hessian @ steps[..., None])[..., 0]
+    hessian = root @ state.curvature[cameras] @ root.swapaxes(1, 2)
+    gradient = here.gradient
+    if not np.array_equal(poses, to[cameras]):
+        steps = logarithms(poses @ invert_each(to[cameras]))
+        gradient = gradient + (hessian @ steps[..., None])[..., 0]
     return Sums.of(
         hessian=hessian,
         gradient=gradient,
         reweighted=here.hessian,
         score=gradient,
         scatter=gradient[:, :, None] * gradient[:, None, :],
-        frames=np.ones(len(matches)),
-        matches=matches,
+        frames=np.ones(len(cameras)),
+        matches=np.concatenate([one.counts for one in gated.values()]),
     )
 
 

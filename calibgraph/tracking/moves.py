@@ -23,7 +23,7 @@ import gtsam
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.model.geometry import adjoints, invert, pose_rows, retract_all, to_T_lidar_camera
+from calibgraph.model.geometry import adjoints, invert, pose_rows, retract_all
 from calibgraph.solver.components import pose_covariance
 from calibgraph.solver.matches import MIN_MATCHES, CameraBlock, merge
 from calibgraph.solver.within_place import WEAK
@@ -82,10 +82,9 @@ def steps_between(
     if by_places is not None:
         covariance += by_places[np.ix_(rows, rows)]
     limits = alarm_limit(state.total_frames[cameras])
-    references = tuple(map(to_T_lidar_camera, state.references[cameras]))
     apart = np.ravel(ends[1] - ends[0])
     return (
-        Steps(tuple(cameras), apart, covariance, limits, references),
+        Steps(tuple(cameras), apart, covariance, limits, state.references[cameras]),
         dict(zip(cameras, ends[1], strict=True)),
     )
 
@@ -523,9 +522,7 @@ def _sums_since(state: State, detected: DetectedStep) -> Sums:
         T = refine(raw, start, scale, state.config)
         gated = Gated.at(T, raw, scale)
         if gated.counts.sum() >= MIN_MATCHES:
-            own = sums_of(state, {camera: gated}, together=True)[0]
-            frames = np.array(float(raw.frames))
-            found = found.replace_at(camera, own.change(frames=frames))
+            found = found.replace_at(camera, sums_of(state, {camera: gated}).total())
     return found
 
 

@@ -79,37 +79,6 @@ class DriftWatch:
         return replace(self, anchors=self.anchors.shift_reference(steps))
 
 
-@dataclass(frozen=True, eq=False)
-class Spread:
-    """What the frames of each camera show of their errors, as ``calibgraph.solver.within_place``.
-
-    Attributes:
-        least: (n,) k, variance of matches of what they do not share, over that of independent ones.
-        excess: (n, 6, 6) K - k.
-        efficiency: (n,) of independent matches: their true variance over that of H, in the mean.
-    """
-
-    least: Array
-    excess: Array
-    efficiency: Array
-
-    @staticmethod
-    def unknown(cameras: int) -> Spread:
-        """Of independent matches."""
-        excess = np.tile(1e-3 * np.eye(6), (cameras, 1, 1))
-        return Spread(np.ones(cameras), excess, np.ones(cameras))
-
-    def mean_variance(self, place_variance: float, alike: Array) -> Array:
-        """(n,) of all matches of a camera, in units of independent ones, in the mean over a pose.
-
-        Args:
-            place_variance: of the matcher.
-            alike: (n,) frames of a place.
-        """
-        within = self.least + np.trace(self.excess, axis1=1, axis2=2) / 6
-        return np.asarray(within + place_variance * self.efficiency * alike)
-
-
 @dataclass(eq=False)
 class State:
     """The whole state of the tracker.
@@ -136,7 +105,6 @@ class State:
         evidence: (n, 4) log-likelihoods of the epochs, forgotten slowly.
         walk: (n,) which of the walks is selected.
         groups: (n, 2) number of epochs, and how much these scatter.
-        spread: of the frames of closed epochs.
         lens: (6, 6 + k) per camera, of closed epochs, by ``calibgraph.solver.lens.lens_columns``.
         lens_errors: (n, 6, 6) covariance of its pose by what may err of its lens.
         curvature: (n, 6, 6) M of :meth:`calibgraph.tracking.gate.Gated.curvature`.
@@ -186,7 +154,6 @@ class State:
     evidence: Array
     walk: Numbers
     groups: Array
-    spread: Spread
     lens: tuple[Array, ...]
     lens_errors: Array
     curvature: Array
@@ -247,7 +214,6 @@ class State:
             evidence=np.zeros((n, walks)),
             walk=np.zeros(n, np.int64),
             groups=np.zeros((n, 2)),
-            spread=Spread.unknown(n),
             lens=(np.zeros((6, 6)),) * n,
             lens_errors=np.zeros((n, 6, 6)),
             curvature=np.tile(np.eye(6), (n, 1, 1)),

@@ -37,11 +37,8 @@ from calibgraph.tracking.epochs import close_epoch
 from calibgraph.tracking.estimate import (
     EpochGraph,
     Estimate,
-    closed_places,
     contradicting,
-    every_place,
     settle,
-    spread_of,
 )
 from calibgraph.tracking.events import Event
 from calibgraph.tracking.frames import StreamFrame, frame_of, prepared, repeated_cameras
@@ -97,12 +94,6 @@ class IncrementalCalibrator:
     def frame(self) -> int | None:
         """Number of the last frame, None before the first."""
         return self._state.frame
-
-    @property
-    def places(self) -> tuple[str, ...]:
-        """Names of the places that are kept apart, the last visited last."""
-        visited = *self._state.places.names[1:], *self._state.at
-        return tuple(reversed(dict.fromkeys(reversed(visited))))
 
     def calibration(self) -> Calibration:
         """The present estimate as a batch's result."""
@@ -226,9 +217,6 @@ class IncrementalCalibrator:
         detected = None if usual else detect_step(state)
         if detected is not None:  # moved so far that frames disagree with the estimate
             taken[-1][1].extend(restart_after_step(state, detected))
-        if state.references is not graph.references:
-            every = every_place(state, closed_places(state), state.all_sums())
-            state.spread = spread_of(state, every)
         if state.sizes[-1] >= state.config.tracking.epoch_frames:
             graph = self._close_epoch(state, taken[-1][1])
         return graph, taken

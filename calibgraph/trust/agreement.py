@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.graph.by_place import place_of
+from calibgraph.graph.latent_poses import place_of
 from calibgraph.model.findings import error_components
 from calibgraph.model.geometry import (
     pose_difference,

@@ -10,13 +10,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from calibgraph.matching.run import MatchingRun
-from calibgraph.model.plausibility import find_implausible
-from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import ABOUT_THE_DATA, BRIGHTNESS, Check
 from calibgraph.trust import (
     agreement,
     guess,
-    image_checks,
+    image_evidence,
     lens_checks,
     matcher_checks,
     solution_checks,
@@ -50,10 +48,10 @@ SOLUTION_CHECKS: tuple[Callable[[Evidence], Checks], ...] = (
 RUN_CHECKS: tuple[Callable[[MatchingRun], Checks], ...] = (
     matcher_checks.last_round_checks,      # have the rounds of matching converged?
     matcher_checks.repeated_file_checks,   # are the frames independent?
-    matcher_checks.rematch_checks,         # does matching from a displaced start end here?
+    matcher_checks.compare_ends,           # does matching from a displaced start end here?
     matcher_checks.going_on_checks,        # did the rounds end elsewhere first?
     matcher_checks.time_limit_checks,      # was anything left out for lack of time?
-    image_checks.image_checks,             # do the images agree with the result?
+    image_evidence.image_checks,           # do the images agree with the result?
     lens_checks.image_offset_checks,       # would they agree better at another time?
 )  # fmt: skip
 """Checks of a run, which also need the matcher, the images or the clouds."""
@@ -73,7 +71,6 @@ def assess_run(run: MatchingRun, evidence: Evidence) -> RunChecks:
     causes = (
         _brightness_checks(run, checks),
         _intended_guess_checks(run, checks),
-        implausible_checks(run.guess, checks),
     )
     return RunChecks(of_solution, of_run, concatenate(causes, evidence.cameras))
 
@@ -106,17 +103,6 @@ def _intended_guess_checks(run: MatchingRun, checks: Checks) -> Checks:
     error = likely_intended_guess(run.dataset, run.guess) if failed else None
     found = [] if error is None else [Check("convention of the guess", "FAIL", error)]
     return dict.fromkeys(failed, found)
-
-
-def implausible_checks(rig: Rig, checks: Checks) -> Checks:
-    """Values of a rig that may explain why checks of a camera FAIL; they decide nothing."""
-    found: dict[str, list[Check]] = {}
-    for line in find_implausible(rig):
-        name, _, text = line.partition(": ")
-        of_camera = checks.get(name, ())
-        if any(check.status == "FAIL" for check in of_camera):
-            found.setdefault(name, []).append(_cause("values of the rig", text, of_camera))
-    return found
 
 
 def _cause(name: str, text: str, explained: Sequence[Check]) -> Check:

@@ -1,4 +1,4 @@
-"""Image evidence: a second pass over images and clouds tests a result.
+"""Image evidence: a second pass over images and clouds tests a result, its lens and the pairing.
 
 Per camera, with the scores of :mod:`calibgraph.matching.structure.shift_scores`:
 
@@ -11,101 +11,56 @@ Per camera, with the scores of :mod:`calibgraph.matching.structure.shift_scores`
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import cv2
 import numpy as np
 
 from calibgraph.arrays import Array
+from calibgraph.errors import CalibrationError
 from calibgraph.io.dataset import Dataset, spread_out
-from calibgraph.io.frame import Frame
-from calibgraph.matching.run import with_motion
+from calibgraph.matching.run import MatchingRun, with_motion
 from calibgraph.matching.structure.consensus import (
     displaced_z_score,
     maximize_score,
     score_displaced,
     z_score,
 )
-from calibgraph.matching.structure.frame_cache import FrameCache, cache_of
 from calibgraph.matching.structure.peaks import extract_correspondences
-from calibgraph.matching.structure.prepared_image import PreparedImage
-from calibgraph.matching.structure.schedule import LEVELS, Level
+from calibgraph.matching.structure.schedule import LEVELS
 from calibgraph.matching.structure.shift_scores import (
     ShiftScores,
     concatenate_scores,
     crop_grids,
-    score_frame,
 )
 from calibgraph.model.clock import clock_of
+from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.places import NOWHERE, Places
 from calibgraph.model.rig import Camera, Rig
+from calibgraph.model.verdict import TOLERANCE, Check
 from calibgraph.parallel import Threads, core_pool
 from calibgraph.progress import Progress, no_progress
 from calibgraph.solver.columns import ColumnFit, apply_twist, block_of, fit_columns
+from calibgraph.trust.evidence import Checks, grade_by_images
 from calibgraph.trust.lens_parameter import (
+    IMAGES,
     NAMES,
     Free,
     LensParameter,
-    lens_fields_px,
+    check_parameter,
     lens_variable,
-    units_of,
 )
-from calibgraph.trust.thresholds import limit
-from factors import Columns, displace
+from calibgraph.trust.pose_posterior import FrameScorer, Images
+from calibgraph.trust.thresholds import limit, threshold
+from factors import Columns, displace, fields_px
 from factors.columns import DISTORTION
 
-Images = Sequence[PreparedImage]
-"""Images of one camera, one per frame."""
-
-MAX_WINDOWS, SHARING_FRAMES = 10_000, 10
-"""Per camera over that many frames; with more frames, as many each."""
 WIDE, FINER = LEVELS[1], LEVELS[2]
 MAX_FRAMES = 20  # evenly spread over the dataset: bounds the time
 MIN_GROUPS = 30  # fewer groups of windows are no evidence
 PAIR_LEVEL = replace(WIDE, reach_rad=np.radians(1.2))
-
-
-class FrameScorer:
-    """Scores frames in parallel; clouds are decoded once."""
-
-    def __init__(self, dataset: Dataset, frames: Sequence[Frame], pool: ThreadPoolExecutor) -> None:
-        self.frames = frames
-        self.dataset = dataset
-        self._pool = pool
-        self._cache = cache_of(frames, FrameCache())
-
-    def load_images(self, name: str, camera: Camera) -> list[PreparedImage]:
-        """Images of a camera, one per frame."""
-        load = partial(self._cache.image, name=name, camera=camera)
-        return list(self._pool.map(load, self.frames))
-
-    def score(
-        self, images: Images, camera: Camera, level: Level, *, offset: int = 0
-    ) -> list[ShiftScores | None]:
-        """Score each image against the cloud ``offset`` frames later; None where there is none."""
-        one = partial(self._score_frame, camera=camera, level=level, offset=offset)
-        return list(self._pool.map(one, images, self.frames))
-
-    def score_together(self, images: Images, camera: Camera, level: Level) -> ShiftScores:
-        """Score all images against their own clouds."""
-        scores = self.score(images, camera, level)
-        return concatenate_scores([each for each in scores if each is not None])
-
-    def _score_frame(
-        self, image: PreparedImage, frame: Frame, *, camera: Camera, level: Level, offset: int
-    ) -> ShiftScores | None:
-        other = self.dataset.neighbour(frame, offset) if offset else frame
-        if other is None:
-            return None
-        most = MAX_WINDOWS // min(len(self.frames), SHARING_FRAMES)
-        cloud, twist = self._cache.cloud(other), other.twist_per_s
-        return score_frame(
-            image, cloud, camera, level, frame=frame.index, max_windows=most, twist_per_s=twist
-        )
 
 
 @dataclass(frozen=True)
@@ -240,7 +195,7 @@ def measure_lens(  # noqa: PLR0913 - what is measured, and by what
     rest = _fit_at_peaks(scorer, refined, again, np.zeros(len(best)), places=places)
     if rest is None:
         return ()
-    fine, units, parameters = rest.counted_from(moved), units_of(camera), []
+    fine, units, parameters = rest.counted_from(moved), np.array(lens.free.sigmas), []
     for name, number in zip(NAMES, searched, strict=True):
         fit, others = fine if number in finer else rough, [n for n in finer if n != number]
         of = LensParameter.of(name, units[[number]], fit.free(*others, number))
@@ -255,7 +210,8 @@ def _with_lens(scorer: FrameScorer, camera: Camera, scores: ShiftScores) -> Shif
     of_groups = np.array([known[number] for number in scores.frame.tolist()]).reshape(-1, 6)
     times_s = clock_of(camera).times_s(scores.pixels_px[:, 1])
     points_m = displace(scores.points_lidar_m, of_groups, -times_s)
-    return scores.with_unknowns(lens_fields_px(camera, points_m))
+    free = lens_variable(camera).free
+    return scores.with_unknowns(fields_px(points_m, camera.T_camera_lidar, free)[1][6:])
 
 
 def _search(camera: Camera, scores: ShiftScores, lens: tuple[int, ...], seed: int) -> Array:
@@ -294,3 +250,97 @@ def _fit_at_peaks(
         shared_variance=max(of_place, limit("lens_match_share") * len(block)),
         considered=len(DISTORTION),
     )
+
+
+def image_checks(run: MatchingRun) -> Checks:
+    """Whether the images agree with a result; nothing if there is no time left for them.
+
+    They are scored as by the matcher ``structure``, which does not use all that other matchers use:
+    the result of a matcher that does not fail on images gets warnings only. Of a solution with
+    camera pairs, the one without them is checked: next to a camera with a wrong lens, a right one
+    is moved, and at the wrong one's place the lens cannot be measured.
+    """
+    if run.out_of_time:
+        return {}
+    rig, config = run.solution.without_pairs().solved_rig, run.solution.config
+    try:
+        checks = check_images(
+            run.dataset, rig, run.correspondences,
+            tolerance=config.tolerance, seed=config.seed, progress=run.progress,
+        )  # fmt: skip
+    except (CalibrationError, OSError) as error:  # files that its matcher did not need
+        text = f"the images could not be checked: {error}"
+        return {name: [Check("image evidence", "WARN", text)] for name in rig.cameras}
+    return grade_by_images(run, checks)
+
+
+def check_images(
+    dataset: Dataset,
+    rig: Rig,
+    table: Correspondences,
+    *,
+    tolerance: tuple[float, float] = TOLERANCE,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> dict[str, tuple[Check, ...]]:
+    """Score images and clouds at the extrinsics of a result, and displaced from them.
+
+    Not observable: a principal point wrong along the shorter side of the image (it is equivalent to
+    a rotation).
+
+    Returns:
+        Checks of every camera but those that a search did not find: theirs is no pose to check.
+    """
+    missed = table.findings.missed
+    cameras = {name: camera for name, camera in rig.cameras.items() if name not in missed}
+    if not cameras:
+        return {}
+    evidence = measure_image_evidence(
+        dataset, Rig(cameras=cameras), places=table.places, seed=seed, progress=progress
+    )
+    if table.is_swept:
+        evidence = {name: replace(found, lens=()) for name, found in evidence.items()}
+    names = {frame.index: frame.name for frame in dataset.frames}
+    return {
+        name: (*evidence_checks(found, names, tolerance), *pairing_checks(found))
+        for name, found in evidence.items()
+    }
+
+
+def evidence_checks(
+    found: ImageEvidence, names: Mapping[int, str], tolerance: tuple[float, float] = TOLERANCE
+) -> tuple[Check, ...]:
+    """The checks of one camera's extrinsic and lens by the image evidence."""
+    if math.isnan(found.displaced_z_score):
+        text = (
+            f"the images could not be checked: only {found.groups} places with structure in both "
+            "image and cloud"
+        )
+        return (Check("image evidence", "WARN", text, found.groups),)
+    displaced = threshold("displaced_z_score").check(found.displaced_z_score)
+    of_pose = displaced, frames_check(found, names)
+    mispaired = found.frames_best <= limit("lens_frames_best")
+    if found.displaced_z_score < limit("lens_z_score") or mispaired:
+        return of_pose  # at a wrong extrinsic the lens cannot be measured
+    return *of_pose, *(check_parameter(each, IMAGES, tolerance) for each in found.lens)
+
+
+def frames_check(found: ImageEvidence, names: Mapping[int, str]) -> Check:
+    """Whether the frames of a camera fit one extrinsic: something may have moved meanwhile.
+
+    A solve leaves such frames out, and the rest agrees.
+    """
+    row, lost = threshold("frames_best"), ", ".join(names[n] for n in found.frames_lost[:5])
+    return row.check(found.frames_best, advice=f"{lost} fit another extrinsic better: {row.advice}")
+
+
+def pairing_checks(found: ImageEvidence) -> tuple[Check, ...]:
+    """Whether images and clouds belong together; nothing without neighbouring frames."""
+    if math.isnan(found.pair_margin):
+        return ()
+    side = "next" if found.pair_offset > 0 else "previous"
+    advice = (
+        f"the images fit the clouds of the {side} frame better; check which image belongs to "
+        "which cloud, and their time stamps"
+    )
+    return (threshold("own_clouds").check(found.pair_margin, advice=advice),)

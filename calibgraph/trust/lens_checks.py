@@ -38,7 +38,6 @@ from calibgraph.trust.lens_parameter import (
     LensParameter,
     check_parameter,
     lens_variable,
-    units_of,
 )
 from calibgraph.trust.thresholds import limit
 from factors import Columns
@@ -70,7 +69,7 @@ def image_offset_checks(run: MatchingRun) -> Checks:
     By a matcher made for them, since that of the run has been released.
     """
     config = run.solution.config
-    if not asks_offset(run):
+    if not asks_offset(run) or run.correspondences.is_swept:
         return {}
     rig, moved, registered = run.solution.without_pairs().solved_rig, None, False
     with suppress(CalibrationError, OSError):  # the checks on images report it
@@ -175,7 +174,8 @@ def intrinsics_checks(evidence: Evidence) -> Checks:
     By all matches, not only those within the gate. The variance of what the frames of a place share
     is taken for at least that of a small share of each match.
     """
-    names = [*evidence.fitted_blocks]
+    is_swept = evidence.solution.correspondences.is_swept  # which looks like a lens
+    names = [] if is_swept else [*evidence.fitted_blocks]
     checks = map_on_cores(lambda name: _check_camera(evidence, name), names)
     return dict(zip(names, checks, strict=True))
 
@@ -184,19 +184,18 @@ def _check_camera(evidence: Evidence, name: str) -> list[Check]:
     solution, block = evidence.solution.without_pairs(), evidence.fitted_blocks[name]
     camera, places = solution.solved_rig.cameras[name], solution.correspondences.places
     of_place = places.frames_per_place(block.frame_numbers) * evidence.findings.place_variance
-    some = block.select_evenly(_MAX_MATCHES)
+    some, lens = block.select_evenly(_MAX_MATCHES), lens_variable(camera).free
     seen = some.select(np.isfinite(some.all_sizes(camera.T_camera_lidar[None])[0]))
     fit = fit_columns(
         seen,
         camera.T_camera_lidar,
-        lens_variable(camera).free,
+        lens,
         loss_scale=solution.scales[name].loss_scale,
         shared_variance=max(of_place, limit("lens_match_share") * len(some)),
     )
     if fit is None:
         return []
-    units = units_of(camera)
-    freed = _free_each(fit)
+    units, freed = np.array(lens.sigmas), _free_each(fit)
     found = [LensParameter.of(n, units[[*numbers]], freed[n]) for n, numbers in _NUMBERS.items()]
     found = [each.with_error(_OF_RIGHT.get(each.name, 0.0)) for each in found]
     tolerance = solution.config.tolerance

@@ -26,7 +26,7 @@ from calibgraph.model.rig import Camera
 from calibgraph.model.verdict import FAIL_ABOVE, PASS_BELOW, TOLERANCE, Check, Status
 from calibgraph.solver.columns import Marginal
 from calibgraph.trust.thresholds import limit, threshold
-from factors import Columns, fields_px
+from factors import Columns
 from factors.columns import ASPECT, CENTRE_X, CENTRE_Y, FOCAL
 
 
@@ -74,17 +74,6 @@ def lens_variable(camera: Camera) -> LensVariable:
     sigmas = dict(zip(all_of.parameters, all_of.sigmas, strict=True)) | {ASPECT: _ASPECT_SIGMA}
     free = Columns(camera.lens, _NAMES, tuple(sigmas[name] for name in _NAMES))
     return LensVariable(camera, free, np.zeros(len(free)))
-
-
-def units_of(camera: Camera) -> Array:
-    """(5,) standard deviations of what is free in a calibrated lens: relative, pixels, or of k1."""
-    return np.array(lens_variable(camera).free.sigmas)
-
-
-def lens_fields_px(camera: Camera, points_lidar_m: Array) -> Array:
-    """(5, 2, n) derivatives of the pixels of points (n, 3) by what is free."""
-    free = lens_variable(camera).free
-    return fields_px(points_lidar_m, camera.T_camera_lidar, free)[1][6:]
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from calibgraph.matching.structure.acceptance import (
 from calibgraph.matching.structure.global_search import ALONE
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.geometry import pose_difference
-from calibgraph.model.verdict import FAIL_ABOVE, TOLERANCE, WENT_ON, Check
+from calibgraph.model.verdict import FAIL_ABOVE, WENT_ON, Check
 from calibgraph.trust.evidence import Checks, Evidence
 from calibgraph.trust.inputs import describe_copies, describe_repeats
 from calibgraph.trust.thresholds import threshold
@@ -138,18 +138,14 @@ def repeated_file_checks(run: MatchingRun) -> Checks:
     return checks
 
 
-def rematch_checks(run: MatchingRun) -> Checks:
-    """Whether matching again from a displaced start ended at the same result."""
-    return compare_ends(run, run.solution.config.tolerance)
-
-
-def compare_ends(run: MatchingRun, tolerance: tuple[float, float] = TOLERANCE) -> Checks:
-    """Per camera, the difference between both ends, for a tolerance [deg, cm]."""
+def compare_ends(run: MatchingRun) -> Checks:
+    """Per camera, the difference between its result and the end from a displaced start."""
     start = f"matching again from a start {REMATCH_DEG:g} deg, {100 * REMATCH_M:g} cm off"
     if run.rematch_failure:
         check = Check("matching again", "FAIL", f"{start} failed: {run.rematch_failure}")
         return {name: [check] for name in run.rematch}
     words = f"{start}: difference"
+    tolerance = run.solution.config.tolerance
     rows = [threshold(f"rematch_{part}", tolerance) for part in ("rotation", "translation")]
     apart = {name: pose_difference(*ends) for name, ends in run.rematch.items()}
     return {

@@ -12,7 +12,8 @@ mean, not the sum: with that the truth is as likely under it as by one camera al
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 
@@ -23,11 +24,19 @@ from scipy.special import expit, logsumexp
 
 from calibgraph.arrays import Array
 from calibgraph.io.dataset import Dataset, spread_out
+from calibgraph.io.frame import Frame
 from calibgraph.matching.structure.consensus import FAR, log_likelihood
+from calibgraph.matching.structure.frame_cache import FrameCache, cache_of
+from calibgraph.matching.structure.prepared_image import PreparedImage
+from calibgraph.matching.structure.schedule import Level
+from calibgraph.matching.structure.shift_scores import (
+    ShiftScores,
+    concatenate_scores,
+    score_frame,
+)
 from calibgraph.model.geometry import pose_rows, relative_transform, twist_between
-from calibgraph.model.rig import RelativePose, Rig
+from calibgraph.model.rig import Camera, Rig
 from calibgraph.parallel import Threads, core_pool
-from calibgraph.trust.image_evidence import FrameScorer
 from calibgraph.trust.probability import probability_beyond
 from factors import pose_sigmas
 
@@ -43,6 +52,52 @@ REACH = pose_sigmas(rotation_rad=np.radians(1.0), translation_m=0.25)
 """(6,) standard deviations of the prior of rounds that ended elsewhere."""
 TIED = 0.1
 """Share of ``REACH`` below which a relative pose ties two cameras: they are elsewhere together."""
+
+
+Images = Sequence[PreparedImage]
+"""Images of one camera, one per frame."""
+
+MAX_WINDOWS, SHARING_FRAMES = 10_000, 10
+"""Per camera over that many frames; with more frames, as many each."""
+
+
+class FrameScorer:
+    """Scores frames in parallel; clouds are decoded once."""
+
+    def __init__(self, dataset: Dataset, frames: Sequence[Frame], pool: ThreadPoolExecutor) -> None:
+        self.frames = frames
+        self.dataset = dataset
+        self._pool = pool
+        self._cache = cache_of(frames, FrameCache())
+
+    def load_images(self, name: str, camera: Camera) -> list[PreparedImage]:
+        """Images of a camera, one per frame."""
+        load = partial(self._cache.image, name=name, camera=camera)
+        return list(self._pool.map(load, self.frames))
+
+    def score(
+        self, images: Images, camera: Camera, level: Level, *, offset: int = 0
+    ) -> list[ShiftScores | None]:
+        """Score each image against the cloud ``offset`` frames later; None where there is none."""
+        one = partial(self._score_frame, camera=camera, level=level, offset=offset)
+        return list(self._pool.map(one, images, self.frames))
+
+    def score_together(self, images: Images, camera: Camera, level: Level) -> ShiftScores:
+        """Score all images against their own clouds."""
+        scores = self.score(images, camera, level)
+        return concatenate_scores([each for each in scores if each is not None])
+
+    def _score_frame(
+        self, image: PreparedImage, frame: Frame, *, camera: Camera, level: Level, offset: int
+    ) -> ShiftScores | None:
+        other = self.dataset.neighbour(frame, offset) if offset else frame
+        if other is None:
+            return None
+        most = MAX_WINDOWS // min(len(self.frames), SHARING_FRAMES)
+        cloud, twist = self._cache.cloud(other), other.twist_per_s
+        return score_frame(
+            image, cloud, camera, level, frame=frame.index, max_windows=most, twist_per_s=twist
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,13 +256,6 @@ MeasurePosteriors = Callable[
 ]
 """The posteriors by the images, of the (6, 6) covariances by the matches and of groups of cameras
 that move together."""
-
-
-def measured_pairs(poses: Iterable[RelativePose]) -> Iterator[tuple[str, str, Array]]:
-    """Relative poses of a rig with their (6, 6) covariances."""
-    for pose in poses:
-        sigmas = np.repeat([pose.rotation_sigma_rad, pose.translation_sigma_m], 3)
-        yield pose.a, pose.b, np.diag(sigmas**2)
 
 
 _EFFECTIVE = 0.8  # share of the samples that each step keeps

@@ -64,7 +64,7 @@ def test_a_motion_of_the_lidar_is_told_from_that_of_all_cameras() -> None:
     assert audit.wrong == ("LiDAR",)
     assert audit.lidar is not None
     assert "turned about z by +" in audit.lidar.reason
-    np.testing.assert_allclose(np.degrees(audit.lidar.motion[:3]), [0, 0, 1], atol=0.05)
+    np.testing.assert_allclose(np.degrees(audit.lidar.deviation[:3]), [0, 0, 1], atol=0.05)
 
 
 def test_all_cameras_moved_otherwise_are_not_taken_for_the_lidar() -> None:

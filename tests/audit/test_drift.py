@@ -9,7 +9,7 @@ import pytest
 
 import calibgraph
 from calibgraph import Calibration, CalibrationError, Check, Verdict
-from tests.audit.drifting import draw, moved, template, twist
+from tests.audit.drifting import draw, template, twist
 
 FINE = {"tolerance_deg": 0.01, "tolerance_cm": 0.5}
 WIDE = 6.0  # times the template's sigmas
@@ -58,7 +58,7 @@ def test_the_lidar_is_told_from_all_cameras() -> None:
     lidar = found.lidar[-1]
     assert lidar is not None
     np.testing.assert_allclose(
-        np.degrees(lidar.motion[:3]), [0, 0, 1], atol=4 * np.degrees(lidar.sigma[:3].max())
+        np.degrees(lidar.deviation[:3]), [0, 0, 1], atol=4 * np.degrees(lidar.sigma[:3].max())
     )
 
 
@@ -193,18 +193,3 @@ def test_the_smallest_detectable_change_is_found_as_often_as_stated() -> None:
         each = calibgraph.drift(given, tolerance_deg=1e-6, tolerance_cm=1e-6).cameras["left"][2]
         found += k % 6 in each.axes
     assert abs(found - 0.9 * draws) < 4 * np.sqrt(draws * 0.9 * 0.1)
-
-
-@pytest.mark.realdata
-def test_recordings_of_one_kitti_car_agree_and_a_turned_camera_is_found(realdata) -> None:
-    folders = [realdata / "kitti_odometry" / "sequences" / name for name in ("05", "06", "08")]
-    rig = calibgraph.load_rig(folders[0])
-    matcher = calibgraph.StructureMatcher(search_deg=None, search_m=None)
-    given = {f.name: calibgraph.calibrate(f, rig, matcher) for f in folders}
-    # Sigmas are up to 0.17 deg and 4 cm: what three times as much could hide is tolerated.
-    wide = {"tolerance_deg": 0.6, "tolerance_cm": 15.0}
-    assert calibgraph.drift(given, **wide).status == "OK"
-    turned = moved(given["06"].rig, {"image_3": twist("yaw", 1.5)})
-    found = calibgraph.drift({**given, "06": replace(given["06"], rig=turned)}, **wide)
-    assert found.changed == (("06", "image_3"),)
-    assert found.cameras["image_3"][1].axes == (1,)

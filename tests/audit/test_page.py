@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 import calibgraph
-from calibgraph import Audit, CameraAudit, LidarAudit
+from calibgraph import Audit, CameraAudit
 from calibgraph.audit.page import measured_camera
 from calibgraph.model.geometry import twist_between
 from tests.audit.deployed import TRUTH
@@ -23,7 +23,7 @@ FEW = CameraAudit("CANNOT TELL", "too few frames: record at least 5", DEVIATION)
 NOTHING = CameraAudit("CANNOT TELL", "0 usable correspondences")
 
 
-def audit_with(*cameras: CameraAudit, lidar: LidarAudit | None = None) -> Audit:
+def audit_with(*cameras: CameraAudit, lidar: CameraAudit | None = None) -> Audit:
     """Of the first cameras of the sample, with its images and clouds."""
     names = [*TRUTH.cameras][: len(cameras)]
     rig = TRUTH.model_copy(update={"cameras": {name: TRUTH.cameras[name] for name in names}})
@@ -39,7 +39,9 @@ def page_of(audit: Audit, folder: Path) -> str:
 
 
 def test_each_camera_has_its_answer_and_its_pictures(tmp_path: Path) -> None:
-    lidar = LidarAudit("turned about z by +1.00 deg", np.array([0, 0, 0.0175, 0, 0, 0]), SIGMA)
+    lidar = CameraAudit(
+        "WRONG", "turned about z by +1.00 deg", np.array([0, 0, 0.0175, 0, 0, 0]), SIGMA
+    )
     for audit, pictures, parts in (
         (audit_with(WRONG, RIGHT), 4,
          ("No. front_left is not where the calibration has it.", "6 frames were matched")),

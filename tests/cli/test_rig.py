@@ -23,8 +23,6 @@ from tests.io.bags.writing import (
 )
 from tests.io.formats.calibration_files import CAMERA_INFO, KALIBR, KOIDE, SENTENCE, URDF, write
 
-LENS = {"fx": 500.0, "fy": 500.0, "cx": 319.5, "cy": 179.5}
-
 
 @pytest.fixture
 def recording(tmp_path: Path) -> Path:
@@ -81,28 +79,6 @@ def test_a_lens_in_words_is_computed_with_what_is_uncertain_of_it(
         assert sigma is not None and sigma.centre == 5.0
         assert sigma.focal == pytest.approx(0.02 * focal_px, abs=0.01)
         assert camera.distortion_sigma == 0.05
-
-
-def test_in_a_terminal_it_asks_for_the_lens_of_each_camera(
-    recording: Path, call: Call, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The answer of one camera is proposed for the next."""
-    asked, answers = [], iter(("90 deg", "90 deg", "calibration"))
-
-    def prompt(question: str, *, default: str, err: bool) -> str:
-        assert err
-        asked.append((question.partition(":")[0], default))
-        return next(answers)
-
-    monkeypatch.setattr("sys.stdin.isatty", lambda: True)
-    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
-    monkeypatch.setattr("typer.prompt", prompt)
-    assert call("rig", recording)[0] == 0
-    assert asked == [
-        ("front_left", "calibration"), ("front_right", "90 deg"), ("left", "90 deg")
-    ]  # fmt: skip
-    cameras = yaml.safe_load((recording / "rig.yaml").read_text())["cameras"]
-    assert [c["intrinsics_px"]["fx"] for c in cameras.values()] == [320.0, 320.0, "FILL_IN"]
 
 
 def test_a_bag_is_listed_and_its_rig_is_written(call: Call, tmp_path: Path) -> None:

@@ -53,7 +53,7 @@ def test_the_folder_of_a_result_is_written_again_and_other_files_stay(
         ("pick {sample} --out .", "holds files, but no calibration.yaml"),
         ("fleet fleet.csv --out .", "holds files, but no calibration.yaml"),
         ("pick {sample} --out out --no-show", "reference.yaml: is of no session of pick"),
-        ("simulate kitti --out .", "holds files, but no calibration.yaml"),
+        ("simulate street --out .", "holds files, but no calibration.yaml"),
         ("calibrate {sample} --out rig.yaml", "is a file, expected a folder"),
         ("solve out table.parquet --out out", "is read by this command"),
         ("solve rig.yaml out/correspondences.parquet --out out", "is read by this command"),

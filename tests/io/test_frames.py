@@ -128,6 +128,8 @@ def test_frames_hold_what_was_given() -> None:
     np.testing.assert_array_equal(data.frames[1].load_cloud(), CLOUD)
     np.testing.assert_array_equal(data.frames[1].load_image("front", SMALL), IMAGE)
     assert data.neighbour(data.frames[0], 1) is data.frames[1]
+    assert data.notes == ()
+    assert dataset(cloud=CLOUD[:, :3]).notes[0].startswith("clouds[0]: no intensity among its fie")
 
 
 NAMED = np.zeros(2, [("Reflectivity", "u1"), ("z", "f8"), ("y", "f8"), ("x", "f8"), ("t", "O")])
@@ -143,8 +145,9 @@ NO_INTENSITY = np.column_stack([CLOUD[:, :3], [np.nan, np.nan]])
         (CLOUD[:, :3].astype(np.float64), NO_INTENSITY),
         (CLOUD.tolist(), CLOUD),
         (NAMED, np.column_stack([CLOUD[:, :3], [3, 4]])),
+        (np.vstack([np.zeros((1, 4)), CLOUD, np.full((1, 4), np.nan)]), CLOUD),
     ],
-    ids=["three doubles", "lists", "named fields"],
+    ids=["three doubles", "lists", "named fields", "no returns"],
 )
 def test_clouds_of_any_array_are_taken(cloud: Any, expected: Any) -> None:
     found = dataset(cloud=cloud).frames[0].load_cloud()

@@ -166,7 +166,7 @@ def test_errors_are_those_at_the_result(pair_without_outliers: Calibration) -> N
 
 def test_arrows_are_the_mean_of_their_cell(solved_pair: Calibration) -> None:
     after = reprojection_errors(solved_pair)["left"]
-    shifted = replace(after, vectors_px=np.tile([0.5, -0.25], (len(after.frame), 1)))
+    shifted = replace(after, vectors_px=np.tile([0.5, -0.25], (len(after.pixels_px), 1)))
     camera = solved_pair.rig.cameras["left"]
     _, means, cell_px = mean_residuals(camera, shifted, ARROW_COLUMNS)
     assert len(means) > 0

@@ -36,7 +36,7 @@ def test_hostile_uploads_end_in_one_line(
         if (found := what_is_wrong(client, upload, small, monkeypatch))
     }
     assert wrong == {}
-    assert len({upload.name for upload in uploads}) >= 45
+    assert len({upload.name for upload in uploads}) >= 38
     assert beside(tmp_path) == {"data"}
     assert not list((service_folder(client) / "arriving").iterdir())
 

@@ -47,7 +47,7 @@ def linearized(model: LatentPoseModel, values: gtsam.Values) -> Linearization:
     keys += [[matched_at_key(place, number) for place in places] for number in model.matched]
     poses = [[values.atPose3(k) if values.exists(k) else none for k in row] for row in keys]
     shared = gtsam.Values(values)
-    for key in {*values.keys()} - {*model.shared_keys}:
+    for key in {*values.keys()} - {*model.columns}:
         shared.erase(key)
     inverses = np.array([[to_T_camera_lidar(pose) for pose in row] for row in poses])
     return Linearization(model, shared, inverses)

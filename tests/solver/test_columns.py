@@ -50,7 +50,7 @@ def test_the_shift_is_how_a_solve_of_the_bent_cloud_differs(mixed_rig: Rig, bend
         pose = to_T_lidar_camera(T)
         block, scale = inliers.blocks[name], solution.scales[name]
         shifts = distortion_evidence(
-            block, scale, pose, np.zeros((6, 6)), places=[np.arange(4)]
+            block, scale, T, np.zeros((6, 6)), places=[np.arange(4)]
         ).jacobian
         found = pose.localCoordinates(to_T_lidar_camera(moved[name]))
         expected, unit = shifts[:, bend] * STEP[bend], np.repeat([1e-3, 0.01], 3)
@@ -72,7 +72,7 @@ def test_a_camera_that_sees_all_round_shows_the_bends(bend: int) -> None:
     (name, T), *_ = solution.T_camera_lidar.items()
     block, scale = solution.inliers.blocks[name], solution.scales[name]
     found = distortion_evidence(
-        block, scale, to_T_lidar_camera(T), np.zeros((6, 6)), places=[np.arange(2), np.arange(2, 4)]
+        block, scale, T, np.zeros((6, 6)), places=[np.arange(2), np.arange(2, 4)]
     )
     information = found.information
     sigmas = np.sqrt(np.diag(np.linalg.inv(information)))

@@ -181,7 +181,7 @@ def of_matches(errors: ErrorFit) -> np.ndarray:
     )
     model = replace(errors.model, components=parts)
     reported = reported_keys(errors)
-    order = to_ordering([*reported, *model.shared_keys, *place_keys(model)])
+    order = to_ordering([*reported, *model.columns, *place_keys(model)])
     starts, end = {}, 0
     for number in range(order.size()):
         starts[order.at(number)] = end

@@ -269,14 +269,13 @@ def moved_on(table: Correspondences, number: int, times: int = 1) -> Corresponde
 
 
 def steps_of(rig: Rig, steps: list[Array], sigma: float) -> Steps:
-    T_lidar_cameras = tuple(gtsam.Pose3(T).inverse() for T in rig.T_camera_lidar.values())
-    n = len(T_lidar_cameras)
+    T, n = np.array([*rig.T_camera_lidar.values()]), len(rig.cameras)
     return Steps(
         tuple(range(n)),
         np.ravel(steps),
         sigma**2 * np.eye(6 * n),
         np.full(n, 60.0),
-        T_lidar_cameras,
+        T,
     )
 
 

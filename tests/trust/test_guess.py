@@ -15,9 +15,7 @@ from scipy.spatial.transform import Rotation
 import calibgraph
 from calibgraph import Intrinsics, MatcherErrors, Rig, load_calibration, load_rig, solve
 from calibgraph.model.geometry import T_OPTICAL_LINK
-from calibgraph.model.verdict import Check
 from calibgraph.solver.joint import solve_joint
-from calibgraph.trust.assess import implausible_checks
 from calibgraph.trust.conventions import (
     convention_error_between,
     correct_guess,
@@ -92,19 +90,6 @@ def test_warnings_are_logged_and_recorded_and_nothing_is_printed(
     assert "principal point (80, 45)" in result.warnings[0]
     assert load_calibration(result.save(tmp_path)).warnings == result.warnings
     assert capfd.readouterr() == ("", "")
-
-
-@pytest.mark.parametrize(("limits", "expected"), [((None, None), "FAIL"), ((1.0, 2.0), "WARN")])
-def test_a_failure_is_explained_but_not_decided_by_values_of_the_rig(
-    limits: tuple[float | None, float | None], expected: str
-) -> None:
-    failed = Check("z-score", "FAIL", "", 3.0, *limits)
-    rig = with_principal_point(80, 45)
-    ((name, (check,)),) = implausible_checks(rig, {"left": [failed]}).items()
-    assert (name, check.status) == ("left", expected)
-    assert check.text.startswith("principal point (80, 45)")
-    passed = Check("z-score", "PASS", "", 30.0)
-    assert implausible_checks(rig, {"left": [passed]}) == {}
 
 
 def test_an_inverted_guess_is_named_though_the_result_is_right(pair: Rig) -> None:

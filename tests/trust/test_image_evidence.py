@@ -20,13 +20,14 @@ from calibgraph.solver.joint import solve_joint
 from calibgraph.trust import image_evidence
 from calibgraph.trust.assess import assess
 from calibgraph.trust.evidence import gather
-from calibgraph.trust.image_checks import (
+from calibgraph.trust.image_evidence import (
+    ImageEvidence,
     check_images,
     evidence_checks,
     frames_check,
+    measure_image_evidence,
     pairing_checks,
 )
-from calibgraph.trust.image_evidence import ImageEvidence, measure_image_evidence
 from calibgraph.trust.image_record import RunChecks, to_metadata
 from calibgraph.trust.inputs import displacement_of_parts
 from calibgraph.trust.pose_posterior import PosePosterior

@@ -15,14 +15,14 @@ from calibgraph.io.frame import Frame
 from calibgraph.model.places import Places
 from calibgraph.solver.columns import apply_twist
 from calibgraph.trust import image_evidence
-from calibgraph.trust.image_checks import evidence_checks
-from calibgraph.trust.image_evidence import WIDE, FrameScorer, ImageEvidence, measure_lens
+from calibgraph.trust.image_evidence import WIDE, ImageEvidence, evidence_checks, measure_lens
 from calibgraph.trust.lens_parameter import (
     NAMES,
     Free,
     LensParameter,
     lens_variable,
 )
+from calibgraph.trust.pose_posterior import FrameScorer
 from tests.conftest import SAMPLE
 
 NAME = "front_left"
@@ -101,10 +101,10 @@ class _Seen(Exception):
 def test_the_lens_is_applied_to_points_where_they_are_when_they_are_seen(
     truth: Camera, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def see(_: Camera, points_m: np.ndarray) -> np.ndarray:
+    def see(points_m: np.ndarray, *_: object) -> np.ndarray:
         raise _Seen(points_m)
 
-    monkeypatch.setattr(image_evidence, "lens_fields_px", see)
+    monkeypatch.setattr(image_evidence, "fields_px", see)
     late = truth.model_copy(update={"time_offset_s": 0.05})
     data, twist = calibgraph.load_dataset(SAMPLE, Rig(cameras={NAME: late})), np.arange(6.0)
     files = [(f.index, f.name, f.cloud_path, f.image_paths) for f in data.frames[:2]]

@@ -29,7 +29,7 @@ from calibgraph.solver.joint import solve_joint
 from calibgraph.trust.agreement import check_competing_solution
 from calibgraph.trust.evidence import Checks
 from calibgraph.trust.matcher_checks import repeated_file_checks
-from calibgraph.trust.observability import weakest_direction
+from calibgraph.trust.solution_checks import weakest_direction
 from tests.conftest import SAMPLE
 from tests.trust.conftest import named, simulated
 

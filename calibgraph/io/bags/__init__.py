@@ -19,7 +19,6 @@ from calibgraph.io.bags.point_clouds import cloud_from_message, timed_points_of
 from calibgraph.io.bags.storage import BagOptions as BagOptions
 from calibgraph.io.bags.storage import is_bag as is_bag
 from calibgraph.io.bags.transforms import stamp_ns_of
-from calibgraph.io.clouds import time_fields
 
 Correction = Callable[[NDArray[np.float32], Array], Array]
 """Of (n, 3) points for motion, by (n,) times after the stamp [s]."""
@@ -32,7 +31,7 @@ def load_bag_cloud(path: Path, correct: Correction | None = None) -> NDArray[np.
         cloud = cloud_from_message(content, str(path))
     else:
         cloud, times_s = timed_points_of(content, str(path))
-        cloud[:, :3] = correct(cloud[:, :3], times_s)
+        cloud[:, :3] = correct(cloud[:, :3], np.zeros(len(cloud)) if times_s is None else times_s)
     if not len(cloud):
         raise FileError(path, "holds no point")
     return cloud
@@ -46,17 +45,14 @@ def load_timed_bag_cloud(
     if start_ns is None:
         return load_bag_cloud(path), None
     cloud, times_s = timed_points_of(content, str(path))
-    has_times = time_fields(each.name for each in content.fields)
-    return cloud, times_s + (stamp_ns_of(content) - start_ns) / 1e9 if has_times else None
+    late_s = (stamp_ns_of(content) - start_ns) / 1e9
+    return cloud, None if times_s is None else times_s + late_s
 
 
 def scan_duration_s(path: Path) -> float | None:
     """Seconds between the first and the last point of a cloud in a message; None without times."""
-    content = read_message(path)[1]
-    if not time_fields(each.name for each in content.fields):
-        return None
-    times_s = timed_points_of(content, str(path))[1]
-    return float(np.ptp(times_s)) if len(times_s) else None
+    times_s = timed_points_of(read_message(path)[1], str(path))[1]
+    return None if times_s is None or not len(times_s) else float(np.ptp(times_s))
 
 
 def load_bag_image(path: Path) -> NDArray[np.uint8]:

@@ -27,21 +27,6 @@ _SAME_SHARE = 2e-3
 """Of the focal length, and of distortion, rotation and baseline: the error of a calibration."""
 
 
-def _same_lens(one: CameraLens, other: CameraLens) -> bool:
-    """Whether two lenses are one, within the errors of a calibration."""
-    if (one.model, one.size_px) != (other.model, other.size_px):
-        return False
-    (a, b), (c, d) = (
-        ([*each.intrinsics_px.model_dump().values()], [*each.distortion, *[0.0] * 8][:8])
-        for each in (one, other)
-    )
-    apart_px = np.abs(np.subtract(a, c)).max()
-    return bool(
-        apart_px < _SAME_SHARE * one.intrinsics_px.fx
-        and np.abs(np.subtract(b, d)).max() < _SAME_SHARE
-    )
-
-
 @dataclass(frozen=True)
 class StatedLens:
     """A lens, as a CameraInfo describes it.
@@ -67,11 +52,17 @@ class StatedLens:
 
     def agrees(self, other: StatedLens) -> bool:
         """Whether it is the same but for what a calibration leaves open: some drivers jitter."""
-        turned = np.abs(self.R_image_frame - other.R_image_frame).max()
-        moved = np.abs(self.baseline_m - other.baseline_m).max()
-        return self.frame == other.frame and _same_lens(self.lens, other.lens) and bool(
-            max(turned, moved) < _SAME_SHARE
+        fx = self.lens.intrinsics_px.fx
+        one, two = (
+            np.hstack([
+                np.array([*each.lens.intrinsics_px.model_dump().values()]) / fx,
+                [*each.lens.distortion, *[0.0] * 8][:8], each.R_image_frame.ravel(),
+                each.baseline_m,
+            ])
+            for each in (self, other)
         )  # fmt: skip
+        said = [(each.frame, each.lens.model, each.lens.size_px) for each in (self, other)]
+        return said[0] == said[1] and bool(np.abs(one - two).max() < _SAME_SHARE)
 
     @property
     def is_turned(self) -> bool:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.arrays import Array
 from calibgraph.errors import DatasetError
 from calibgraph.io.bags.messages import describe_message
 from calibgraph.io.bags.transforms import stamp_ns_of
@@ -34,18 +35,17 @@ def cloud_from_message(message: Any, where: str = "") -> NDArray[np.float32]:
     return np.asarray(cloud[returned], dtype=np.float32)
 
 
-def timed_points_of(message: Any, where: str) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+def timed_points_of(message: Any, where: str) -> tuple[NDArray[np.float32], Array | None]:
     """The points of a message that are returns, and when each was taken.
 
     Returns:
-        (n, 4) as of :func:`cloud_from_message`; (n,) seconds after the stamp, zeros if points have
-        no times.
+        (n, 4) as of :func:`cloud_from_message`; (n,) seconds after the stamp, None without times.
     """
     cloud, returned = _all_points(message, where)
     points = np.asarray(cloud[returned], dtype=np.float32)
     names = time_fields(each.name for each in message.fields)
     if not names:
-        return points, np.zeros(len(points))
+        return points, None
     times = _structured(message, where, names[:1])[names[0]][returned]
     return points, seconds_after(stamp_ns_of(message), times, f"{where}: {names[0]}")
 

@@ -7,7 +7,7 @@ with the parent in ``header.frame_id``.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -99,46 +99,38 @@ def _read_tree(
     On /tf, those that are the same throughout. The source is noted on each link.
     """
     links, invalid, moving = dict[str, Link](), dict[str, str](), set[str]()
-    for each in stamped_transforms(bag, name):
-        if each.T_parent_child is None:
-            invalid[each.child] = each.text
+    for _, child, found in stamped_transforms(bag, name):
+        if isinstance(found, str):
+            invalid[child] = found
             continue
-        link = Link(each.parent, each.child, each.T_parent_child, source)
-        first = links.setdefault(each.child, link)
+        link = found._replace(note=source)
+        first = links.setdefault(child, link)
         change = np.abs(link.T_parent_child - first.T_parent_child).max()
         if name == STATIC:
-            links[each.child] = link
+            links[child] = link
         elif link.parent != first.parent or change > _SAME:
-            moving.add(each.child)
+            moving.add(child)
     for child in moving:
         del links[child]
     return links, invalid, moving
 
 
-class StampedTransform(NamedTuple):
-    """A TransformStamped; (4, 4) T_parent_child is None, and the text why, if it is none."""
+def stamped_transforms(bag: Bag, name: str) -> Iterator[tuple[int, str, Link | str]]:
+    """The transforms on all topics of a bag with this last name.
 
-    parent: str
-    child: str
-    stamp_ns: int
-    T_parent_child: Array | None
-    text: str
-
-
-def stamped_transforms(bag: Bag, name: str) -> Iterator[StampedTransform]:
-    """The transforms on all topics of a bag with this last name."""
+    Each with its stamp [ns] and its child frame; in place of one that is none, why.
+    """
     topics = [each.name for each in bag.of_type(*TREES) if each.name.split("/")[-1] == name]
     for message in bag.messages(topics):
         for each in message.content.transforms:
-            child = each.child_frame_id.lstrip("/")
+            child, parent = each.child_frame_id.lstrip("/"), each.header.frame_id.lstrip("/")
             shift, turn = values_of(each.transform.translation, each.transform.rotation)
             T = pose_matrix(shift, turn)
-            text = "" if T is not None else (
+            found = Link(parent, child, T) if T is not None else (
                 f"{bag.path}: the transform of frame {child!r} on {message.topic} has the "
                 f"translation {shift} and the quaternion {turn}"
             )  # fmt: skip
-            parent = each.header.frame_id.lstrip("/")
-            yield StampedTransform(parent, child, stamp_ns_of(each), T, text)
+            yield stamp_ns_of(each), child, found
 
 
 def values_of(shift: Any, turn: Any) -> tuple[tuple[float, ...], tuple[float, ...]]:

@@ -163,16 +163,16 @@ def _triple(values: Array, digits: int) -> str:
     return ", ".join(f"{value + 0.0:.{digits}f}" for value in values)
 
 
-def carried_coefficients(name: str, camera: Camera, most: int, what: str) -> list[float]:
-    """A pinhole's coefficients, ``most`` of them, in OpenCV's order."""
-    padded = [*camera.distortion, *[0.0] * most]
-    if any(padded[most:]):
+def radtan_coefficients(name: str, camera: Camera) -> list[float]:
+    """A pinhole's coefficients, of which Kalibr has four."""
+    padded = [*camera.distortion, *[0.0] * 4]
+    if any(padded[4:]):
         raise CalibrationError(
-            f"camera {name!r}: {what} holds {most or 'no'} distortion coefficients, this lens has "
+            f"camera {name!r}: Kalibr's radtan holds 4 distortion coefficients, this lens has "
             f"{camera.distortion}; choose another --format (opencv, json)",
             camera=name,
         )
-    return padded[:most]
+    return padded[:4]
 
 
 def commented_yaml(statement: Iterable[str], content: dict[str, Any]) -> str:
@@ -405,7 +405,7 @@ def _projection(name: str, camera: Camera) -> dict[str, Any]:
     elif camera.model == "fisheye":
         distortion = "equidistant"
     elif any(coefficients):
-        coefficients = carried_coefficients(name, camera, 4, "Kalibr's radtan")
+        coefficients = radtan_coefficients(name, camera)
     else:
         distortion, coefficients = "none", []
     return {

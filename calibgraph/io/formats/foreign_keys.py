@@ -215,10 +215,7 @@ class _Map:
         return numbers(self._content[key], f"{self._where}: {key}")
 
     def _number(self, key: str) -> float:
-        found = self._numbers(key)
-        if found.size != 1:
-            raise FileError(f"{self._where}: {key}", f"has {found.size} numbers, expected one")
-        return float(found.item())
+        return number(self._content[key], f"{self._where}: {key}")
 
     def _intrinsics(self) -> Intrinsics:
         matrix = self._key("K")
@@ -325,6 +322,14 @@ def numbers(value: Any, where: str) -> Array:
                             f"columns and {found.size} numbers")  # fmt: skip
         found = found.reshape(rows, cols)
     return found.astype(np.float64)
+
+
+def number(value: Any, where: str) -> float:
+    """A number, also as a list or matrix of one."""
+    found = numbers(value, where)
+    if found.size != 1:
+        raise FileError(where, f"has {found.size} numbers, expected one")
+    return float(found.item())
 
 
 def _plain(key: str) -> str:

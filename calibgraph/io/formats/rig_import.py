@@ -18,7 +18,7 @@ from calibgraph.errors import CalibrationError, FileError
 from calibgraph.files import checked_model, read_json, read_text, require_file
 from calibgraph.io.bags import is_bag
 from calibgraph.io.bags.rig import read_bag_rig
-from calibgraph.io.formats.foreign_keys import Foreign, numbers, read_foreign
+from calibgraph.io.formats.foreign_keys import Foreign, number, read_foreign
 from calibgraph.io.kitti import CALIBRATION_NAME
 from calibgraph.io.lenses import CameraLens
 from calibgraph.io.rig_parts import (
@@ -154,7 +154,7 @@ def read_autoware(content: dict[str, Any], path: Path) -> RigParts:
             keys = ", ".join(_ANGLES)
             raise FileError(where, f"expected the keys {keys}, found {describe_value(pose)}")
         try:
-            values = [numbers(pose[key], f"{where}: {key}").item() for key in _ANGLES]
+            values = [number(pose[key], f"{where}: {key}") for key in _ANGLES]
             T = pose_of_angles(values[:3], values[3:])
         except ValueError as error:
             raise FileError(path, f"{parent}: {child}: {error}") from error

@@ -19,7 +19,6 @@ import yaml
 
 from calibgraph import CalibrationError, FileError, load_dataset, load_rig
 from calibgraph.io.bags import load_bag_cloud, load_bag_image
-from calibgraph.io.bags.files import McapFile
 from calibgraph.io.bags.messages import Bag
 from tests.conftest import SAMPLE
 from tests.io.bags.writing import (
@@ -57,7 +56,6 @@ NOT_WHOLE: dict[str, dict[str, Any]] = {
     "no_chunks": {"use_chunking": False},
     "no_chunks_no_statistics": {"use_chunking": False, "use_statistics": False},
 }
-LATEST_NS = 2**63 - 1
 
 
 def write_mcap(
@@ -127,19 +125,6 @@ def test_a_file_whose_index_is_not_whole_is_named_with_the_repair(
     path = write_mcap(tmp_path / "drive.mcap", sample_messages(MAKE), **NOT_WHOLE[name])
     with pytest.raises(FileError, match=r"index is not whole .*; write one with `mcap recover "):
         load_rig(path)
-
-
-@pytest.mark.parametrize("name", ["whole", "no_message_index"])
-def test_messages_come_by_time_and_only_those_asked_for(tmp_path: Path, name: str) -> None:
-    messages = sample_messages(MAKE)
-    shuffled = [messages[i] for i in np.random.default_rng(3).permutation(len(messages))]
-    path = write_mcap(tmp_path / "drive.mcap", shuffled, **WHOLE[name])
-    expected = sorted(each.record_ns for each in messages if each.topic == "/points")
-    file = McapFile(path)
-    found = [time_ns for _, time_ns, _ in file.messages(["/points"], 0, LATEST_NS)]
-    assert found == expected
-    assert [t for _, t, _ in file.messages(["/points"], expected[1], expected[4])] == expected[1:4]
-    file.close()
 
 
 @pytest.mark.parametrize(

@@ -41,102 +41,87 @@ def read(pixels: NDArray[Any], encoding: str, **layout: Any) -> NDArray[np.uint8
     return image_from_message(MAKE.image(pixels, encoding, START_NS, **layout), "here")
 
 
-def test_colours_are_read_in_their_order() -> None:
-    opaque = np.dstack([BGR, np.full(GRAY.shape, 255, np.uint8)])
-    np.testing.assert_array_equal(read(BGR, "bgr8"), BGR)
-    np.testing.assert_array_equal(read(BGR, "8UC3"), BGR)
-    np.testing.assert_array_equal(read(BGR[..., ::-1], "rgb8"), BGR)
-    np.testing.assert_array_equal(read(opaque, "bgra8"), BGR)
-    np.testing.assert_array_equal(read(opaque[..., [2, 1, 0, 3]], "rgba8"), BGR)
-    np.testing.assert_array_equal(read(GRAY, "mono8"), np.dstack([GRAY] * 3))
+OPAQUE = np.dstack([BGR, np.full(GRAY.shape, 255, np.uint8)])
+BRIGHT = GRAY.copy()
+BRIGHT[0, 0] = 255  # what fixes the depth of 16 bits
+MASK = np.ones(80, bool)
+MASK[[0, 1, *range(37, 43), 78, 79]] = False  # where neighbours of a mosaic have another colour
+COLOURS = np.zeros((60, 80, 3), np.uint8)
+COLOURS[:, :40], COLOURS[:, 40:] = (200, 90, 30), (20, 140, 250)
 
 
-def test_padded_rows_are_cut_off_and_the_image_can_be_drawn_on() -> None:
-    found = read(BGR, "bgr8", padding=7)
-    np.testing.assert_array_equal(found, BGR)
-    assert found.flags.writeable
-    assert read(BGR, "bgr8").flags.writeable
+def mosaic(channels: str) -> NDArray[np.uint8]:
+    """Pixels of which each has one of BGR's channels: (0, 0), (0, 1), (1, 0), (1, 1)."""
+    found = np.zeros((60, 80), np.uint8)
+    for place, channel in enumerate(channels):
+        pixels = np.s_[place // 2 :: 2, place % 2 :: 2]
+        found[pixels] = COLOURS[pixels][..., int(channel)]
+    return found
 
 
-@pytest.mark.parametrize("big_endian", [False, True])
-@pytest.mark.parametrize("bits", [10, 12, 14, 16])
-def test_the_used_bits_of_16_are_kept(bits: int, big_endian: bool) -> None:
-    bright = GRAY.copy()
-    bright[0, 0] = 255  # what fixes the depth
-    wide = bright.astype(np.uint16) << (bits - 8)
-    for encoding in ("mono16", "16UC1"):
-        found = read(wide, encoding, big_endian=big_endian)
-        np.testing.assert_array_equal(found, np.dstack([bright] * 3))
-
-
-@pytest.mark.parametrize(
-    ("pattern", "channels"),  # BGR's channel at (0, 0), (0, 1), (1, 0), (1, 1)
-    [
-        ("rggb", (2, 1, 1, 0)),
-        ("bggr", (0, 1, 1, 2)),
-        ("gbrg", (1, 0, 2, 1)),
-        ("grbg", (1, 2, 0, 1)),
-    ],
-)
-@pytest.mark.parametrize("wide", [False, True])
-def test_mosaics_give_their_colours_back(
-    pattern: str, channels: tuple[int, int, int, int], wide: bool
-) -> None:
-    colours = np.zeros((60, 80, 3), np.uint8)
-    colours[:, :40], colours[:, 40:] = (200, 90, 30), (20, 140, 250)
-    mosaic = np.zeros((60, 80), np.uint8)
-    for (row, column), channel in zip(((0, 0), (0, 1), (1, 0), (1, 1)), channels, strict=True):
-        mosaic[row::2, column::2] = colours[row::2, column::2, channel]
-    if wide:
-        found = read(mosaic.astype(np.uint16) << 8, f"bayer_{pattern}16")
-    else:
-        found = read(mosaic, f"bayer_{pattern}8")
-    inner = np.ones(80, bool)
-    inner[[0, 1, *range(37, 43), 78, 79]] = False  # where neighbours have another colour
-    np.testing.assert_array_equal(found[2:-2, inner], colours[2:-2, inner])
-
-
-@pytest.mark.parametrize(
-    ("encoding", "order"),
-    [("uyvy", "uy"), ("yuv422", "uy"), ("yuy2", "yu"), ("yvyu", "yv"), ("yuyv", "yu"),
-     ("YUV422_YUY2", "yu")],
-)  # fmt: skip
-def test_colours_of_packed_yuv_are_in_their_places(encoding: str, order: str) -> None:
+def packed(order: str) -> NDArray[np.uint8]:
+    """Yuv of one colour, two pixels of which share u and v."""
     planar = cv2.cvtColor(np.full((8, 8, 3), (200, 90, 30), np.uint8), cv2.COLOR_BGR2YUV_I420)
-    y, u, v = planar[0, 0], planar[8, 0], planar[11, 0]
-    first, second = (u, v) if "u" in order else (v, u)
-    pairs = [(first, y), (second, y)] if order[0] != "y" else [(y, first), (y, second)]
-    found = read(np.tile(np.uint8([pairs]), (6, 4, 1)), encoding)
-    np.testing.assert_allclose(found, np.full((6, 8, 3), (200, 90, 30)), atol=3)
+    values = {"y": planar[0, 0], "u": planar[8, 0], "v": planar[11, 0]}
+    pairs = [[values[order[0]], values[order[1]]], [values[order[2]], values[order[3]]]]
+    return np.tile(np.uint8([pairs]), (6, 4, 1))
+
+
+MOSAICS = {"rggb": "2110", "bggr": "0112", "gbrg": "1021", "grbg": "1201"}
+YUV = {"uyvy": "uyvy", "yuv422": "uyvy", "yuy2": "yuyv", "yvyu": "yvyu", "yuyv": "yuyv",
+       "YUV422_YUY2": "yuyv"}  # fmt: skip
+PIXELS: list[tuple[str, NDArray[Any], NDArray[Any]]] = [
+    ("bgr8", BGR, BGR), ("8UC3", BGR, BGR), ("rgb8", BGR[..., ::-1], BGR), ("bgra8", OPAQUE, BGR),
+    ("rgba8", OPAQUE[..., [2, 1, 0, 3]], BGR), ("mono8", GRAY, np.dstack([GRAY] * 3)),
+    *((encoding, BRIGHT.astype(np.uint16) << (bits - 8), np.dstack([BRIGHT] * 3))
+      for encoding in ("mono16", "16UC1") for bits in (10, 12, 14, 16)),
+    *((f"bayer_{pattern}{bits}", mosaic(channels).astype(f"u{bits // 8}") << (bits - 8), COLOURS)
+      for pattern, channels in MOSAICS.items() for bits in (8, 16)),
+    *((encoding, packed(order), np.full((6, 8, 3), (200, 90, 30))) for encoding, order in
+      YUV.items()),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("layout", [{}, {"padding": 7}, {"big_endian": True}], ids=str)
+@pytest.mark.parametrize("row", PIXELS, ids=lambda row: row[0])
+def test_pixels_of_any_encoding_and_layout_give_their_colours_back(
+    row: tuple[str, NDArray[Any], NDArray[Any]], layout: dict[str, Any]
+) -> None:
+    encoding, pixels, expected = row
+    found = read(pixels, encoding, **layout)
+    inner = np.s_[2:-2, MASK] if encoding.startswith("bayer") else np.s_[:]
+    tolerance = 3 if encoding in YUV else 0
+    np.testing.assert_allclose(found[inner], expected[inner], atol=tolerance)
+    assert found.flags.writeable
+
+
+JPEG = (SAMPLE / "cameras" / "left" / "000000.jpg").read_bytes()
+WIDE = GRAY.astype(np.uint16) << 4
+WIDE[0, 0] = 255 << 4
+
+
+def png(image: NDArray[Any]) -> bytes:
+    return bytes(cv2.imencode(".png", image)[1].tobytes())
 
 
 @pytest.mark.parametrize(
-    "form", ["jpeg", "bgr8; jpeg compressed bgr8", "rgb8; jpeg compressed bgr8"]
-)
-def test_jpeg_is_read(form: str) -> None:
-    data = (SAMPLE / "cameras" / "left" / "000000.jpg").read_bytes()
-    np.testing.assert_array_equal(
-        image_from_message(MAKE.compressed(data, form, START_NS), "here"), BGR
-    )
-
-
-def png(image: NDArray[Any], form: str) -> NDArray[np.uint8]:
-    data = cv2.imencode(".png", image)[1].tobytes()
-    return image_from_message(MAKE.compressed(data, form, START_NS), "here")
-
-
-def test_png_is_read_in_the_order_in_which_it_was_stored() -> None:
-    np.testing.assert_array_equal(png(BGR, "png"), BGR)
-    np.testing.assert_array_equal(png(BGR[..., ::-1], "rgb8; png compressed rgb8"), BGR)
-    wide = GRAY.astype(np.uint16) << 4
-    wide[0, 0] = 0xFFF
-    np.testing.assert_array_equal(png(wide, "mono16; png compressed ")[1:, :, 0], GRAY[1:])
-
-
-def test_a_compressed_mosaic_gives_its_colours_back() -> None:
-    mosaic = np.tile(np.uint8([[30, 90], [90, 200]]), (20, 30))
-    found = png(mosaic, "bayer_rggb8; png compressed ")
-    np.testing.assert_array_equal(found[2:-2, 2:-2], np.full((36, 56, 3), (200, 90, 30)))
+    ("form", "data", "expected"),
+    [
+        *((form, JPEG, BGR) for form in ("jpeg", "bgr8; jpeg compressed bgr8",
+                                         "rgb8; jpeg compressed bgr8")),
+        ("png", png(BGR), BGR),
+        ("rgb8; png compressed rgb8", png(BGR[..., ::-1]), BGR),
+        ("mono16; png compressed ", png(WIDE), np.dstack([BRIGHT] * 3)),
+        ("bayer_rggb8; png compressed ", png(mosaic(MOSAICS["rggb"])), COLOURS),
+    ],
+    ids=range(7),
+)  # fmt: skip
+def test_compressed_images_are_read_in_the_order_in_which_they_were_stored(
+    form: str, data: bytes, expected: NDArray[Any]
+) -> None:
+    found = image_from_message(MAKE.compressed(data, form, START_NS), "here")
+    inner = np.s_[2:-2, MASK] if "bayer" in form else np.s_[:]
+    np.testing.assert_array_equal(found[inner], expected[inner])
 
 
 def test_images_that_cannot_be_read_are_named() -> None:
@@ -146,9 +131,8 @@ def test_images_that_cannot_be_read_are_named() -> None:
         image_from_message(cut, "here")
     with pytest.raises(DatasetError, match="here: image encoding '32FC1' is unknown; known are m"):
         read(GRAY, "32FC1")
-    data = (SAMPLE / "cameras" / "left" / "000000.jpg").read_bytes()
     with pytest.raises(DatasetError, match="here: is truncated"):
-        image_from_message(MAKE.compressed(data[:-100], "jpeg", START_NS), "here")
+        image_from_message(MAKE.compressed(JPEG[:-100], "jpeg", START_NS), "here")
     with pytest.raises(DatasetError, match="its format 'h264' is neither JPEG nor PNG"):
         image_from_message(MAKE.compressed(b"\0\0\0\1g", "h264", START_NS), "here")
 

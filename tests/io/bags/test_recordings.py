@@ -43,6 +43,9 @@ from tests.io.bags.writing import (
 
 POINTS, LEFT = "/points", "/left/image_raw/compressed"
 MS = 1_000_000
+MAKE = Messages("mcap")
+RIG = load_rig(SAMPLE)
+NAMES = [*RIG.cameras]
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -92,35 +95,44 @@ def numbers(data: Dataset) -> list[int]:
     return [frame.index for frame in data.frames]
 
 
-def test_images_pair_with_the_cloud_of_the_nearest_stamp(tmp_path: Path) -> None:
-    def delay(each: Stamped) -> Stamped:
-        late = number_of(each) * 4 * MS if each.topic == LEFT else 0
-        return restamped(each, stamp_of(each) + late) if late else each
-
-    bag = recording(tmp_path, delay)
-    assert numbers(load_dataset(bag)) == [0, 1, 2, 3, 4, 5]
-    near = load_dataset(bag, bag=BagOptions(sync_tolerance_s=0.012))  # 3 ms, and 0, 4, 8, ...
-    assert numbers(near) == [0, 1, 2]
-    assert "6 clouds, 3 with all images within 0.012 s" in near.notes[-1]
-    assert "left +7 ms (median), at most 11; 3 without an image of left" in near.notes[-1]
+def delayed(each: Stamped) -> Stamped:
+    late = number_of(each) * 4 * MS if each.topic == LEFT else 0
+    return restamped(each, stamp_of(each) + late) if late else each
 
 
-def test_repeated_stamps_and_empty_clouds_are_left_out_and_counted(tmp_path: Path) -> None:
-    make = Messages("mcap")
-    nothing = structured(np.full((5, 4), np.nan, np.float32))
+def spoilt(each: Stamped) -> Stamped:
+    """An empty cloud, and one that repeats a stamp."""
+    if each.topic == POINTS and number_of(each) == 1:
+        nothing = structured(np.full((5, 4), np.nan, np.float32))
+        return replace(each, content=MAKE.cloud(nothing, stamp_of(each)))
+    repeats = each.topic == POINTS and number_of(each) == 4
+    return restamped(each, START_NS + 3 * PERIOD_NS) if repeats else each
 
-    def spoil(each: Stamped) -> Stamped:
-        if each.topic == POINTS and number_of(each) == 1:
-            return replace(each, content=make.cloud(nothing, stamp_of(each)))
-        if each.topic == POINTS and number_of(each) == 4:
-            return restamped(each, START_NS + 3 * PERIOD_NS)
-        return each
 
-    data = load_dataset(recording(tmp_path, spoil))
-    assert [frame.name for frame in data.frames] == [
-        str(START_NS + number * PERIOD_NS) for number in (0, 2, 3, 5)
-    ]
-    assert "/points: 1 have no point; /points: 1 repeat a stamp" in data.notes[-1]
+def of_another_frame(each: Stamped) -> Stamped:
+    if each.topic == POINTS and number_of(each) in (2, 5):
+        each.content.header.frame_id = "rear"
+    return each
+
+
+LEFT_OUT: list[tuple[Change, BagOptions, list[int], str]] = [
+    (delayed, BagOptions(), [0, 1, 2, 3, 4, 5], "6 clouds, 6 with all images within 0.05 s"),
+    (delayed, BagOptions(sync_tolerance_s=0.012), [0, 1, 2],  # 3 ms, and 0, 4, 8, ...
+     "left +7 ms (median), at most 11; 3 without an image of left"),
+    (spoilt, BagOptions(), [0, 2, 3, 5], "/points: 1 have no point; /points: 1 repeat a stamp"),
+    (of_another_frame, BagOptions(), [0, 1, 3, 4],
+     "/points: 2 name another frame than the first (rear, not velodyne)"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("row", LEFT_OUT, ids=lambda row: row[-1])
+def test_messages_that_make_no_frame_are_left_out_and_counted(
+    row: tuple[Change, BagOptions, list[int], str], tmp_path: Path
+) -> None:
+    change, options, kept, note = row
+    data = load_dataset(recording(tmp_path, change), bag=options)
+    assert [frame.name for frame in data.frames] == [str(START_NS + n * PERIOD_NS) for n in kept]
+    assert note in data.notes[-1]
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -208,11 +220,6 @@ def test_a_folder_of_files_compressed_as_a_whole_names_what_unpacks_them(
     with zstandard.open(packed, "rb") as content:
         packed.with_suffix("").write_bytes(content.read())
     assert len(load_dataset(packed.with_suffix("")).frames) == 6
-
-
-MAKE = Messages("mcap")
-RIG = load_rig(SAMPLE)
-NAMES = [*RIG.cameras]
 
 
 def renamed(image: str, info: str) -> Change:
@@ -378,17 +385,6 @@ def test_a_time_of_recording_that_is_wrong_costs_nothing(
     lost = topic in ("/left/image_raw/compressed", "/points")
     assert len(data.frames) == len(whole.frames) == (5 if lost else 6)
     assert max(frame.index for frame in data.frames) < 20
-
-
-def test_clouds_of_another_frame_are_left_out_and_counted(tmp_path: Path) -> None:
-    def change(each: Stamped) -> Stamped:
-        if each.topic == "/points" and number_of(each) in (2, 5):
-            each.content.header.frame_id = "rear"
-        return each
-
-    data = load_dataset(recording(tmp_path, change))
-    assert len(data.frames) == 4
-    assert "/points: 2 name another frame than the first (rear, not velodyne)" in data.notes[-1]
 
 
 def turned(orientation: int, form: str) -> bytes:

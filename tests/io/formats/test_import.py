@@ -18,7 +18,6 @@ from calibgraph import (
     FileError,
     Rig,
     describe_rig,
-    export_calibration,
     import_rig,
     load_rig,
 )
@@ -173,41 +172,6 @@ def test_one_frame_serves_all_cameras_of_a_chain(tmp_path: Path) -> None:
     expected = import_rig(saved({"whole.yaml": TEXTS["camchain"]}, tmp_path))
     for name, T in expected.T_camera_lidar.items():
         np.testing.assert_allclose(rig.T_camera_lidar[name], T, atol=1e-12)
-
-
-@pytest.mark.parametrize("format", ["kalibr", "ros2-launch", "urdf", "autoware", "opencv"])
-def test_what_was_exported_is_imported_again(format: str, tmp_path: Path) -> None:
-    rig = varied_rig()
-    suffix = {"urdf": "urdf", "ros2-launch": "launch.xml"}.get(format, "yaml")
-    path = tmp_path / f"file.{suffix}"
-    export_calibration(rig, path, format)
-    files = [path]
-    if format in ("ros2-launch", "urdf", "autoware"):  # frames alone: with the lenses of a rig
-        export_calibration(rig, tmp_path / "lenses.yaml", "opencv")
-        text = (tmp_path / "lenses.yaml").read_text().replace("T_camera_lidar:", "other:")
-        (tmp_path / "lenses.yaml").write_text(text)
-        files.append(tmp_path / "lenses.yaml")
-    again = import_rig(files, size_px=(1240, 376))
-    assert not again.relative_poses  # what was computed from T_camera_lidar is no measurement
-    assert list(again.cameras) == list(rig.cameras)
-    for name, camera in rig.cameras.items():
-        np.testing.assert_allclose(
-            again.T_camera_lidar[name], camera.T_camera_lidar, atol=1e-9, rtol=0
-        )
-        assert again.cameras[name].intrinsics_px == camera.intrinsics_px
-        assert again.cameras[name].width_px == camera.width_px
-
-
-def test_a_json_export_is_a_rig(mixed_rig: Rig, tmp_path: Path) -> None:
-    for rig in (mixed_rig, varied_rig()):
-        export_calibration(rig, tmp_path / "rig.json", "json", force=True)
-        for read in (load_rig(tmp_path / "rig.json"), import_rig([tmp_path / "rig.json"])):
-            assert list(read.cameras) == list(rig.cameras)
-            for name, camera in rig.cameras.items():
-                found = read.cameras[name]
-                lens = ("model", "distortion", "intrinsics_px", "width_px", "height_px")
-                assert all(getattr(found, key) == getattr(camera, key) for key in lens)
-                np.testing.assert_allclose(found.T_camera_lidar, camera.T_camera_lidar, atol=1e-12)
 
 
 def test_a_kitti_sequence_is_imported(tmp_path: Path) -> None:

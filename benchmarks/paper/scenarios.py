@@ -1,11 +1,10 @@
 """Named scenarios of correspondences: a rig, and the errors of its matcher."""
 
-from dataclasses import replace
-from pathlib import Path
+from __future__ import annotations
 
-from calibgraph.files import require_own_folder
+from dataclasses import replace
+
 from calibgraph.model.correspondences import Correspondences
-from calibgraph.model.metrics import perturb
 from calibgraph.simulation.correspondences import (
     MatcherErrors,
     PoseSpread,
@@ -13,34 +12,7 @@ from calibgraph.simulation.correspondences import (
 )
 from calibgraph.simulation.rigs import rig_of
 
-MAX_FRAMES = 10_000
 MATCHES = 1000  # per camera and frame: the paper's grid keeps at most as many
-
-
-def simulate_table(
-    out: Path, name: str, *, frames: int, rotation_deg: float, translation_m: float, seed: int
-) -> list[Path]:
-    """Write the correspondences of a scenario with its truth and a guess.
-
-    Returns:
-        The files.
-
-    Raises:
-        ValueError: if there is no such scenario, or an argument is out of range.
-        FileError: if the folder holds files.
-    """
-    if name not in SCENARIOS:
-        raise ValueError(f"unknown scenario {name!r}; known are street, {', '.join(SCENARIOS)}")
-    if not 1 <= frames <= MAX_FRAMES:
-        raise ValueError(f"{frames} frames: expected 1 to {MAX_FRAMES}")
-    truth = rig_of(name)
-    guess = perturb(truth, rotation_deg=rotation_deg, translation_m=translation_m, seed=seed)
-    require_own_folder(out)
-    paths = [out / file for file in ("correspondences.parquet", "reference.yaml", "rig.yaml")]
-    draw_scenario(name, frames, seed).save(paths[0])
-    truth.save(paths[1])
-    guess.save(paths[2])
-    return paths
 
 
 def draw_scenario(name: str, frames: int, seed: int) -> Correspondences:
