@@ -41,7 +41,7 @@ from calibgraph.matching.structure.window_weights import (
     window_network,
 )
 from calibgraph.matching.structure.windows import Windows
-from calibgraph.simulation.scan_errors import draw_scan_errors
+from tools.scenes.scan_errors import draw_scan_errors
 from tools.scenes.sensor_streets import aligned_rig, pair, wide
 from tools.scenes.surroundings import SURROUNDINGS
 

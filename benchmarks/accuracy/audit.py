@@ -42,7 +42,7 @@ from calibgraph import (
 )
 from calibgraph.audit.judgement import CAMERA_AXES, FALSE_ALARM_RATE, POWER, Limits
 from calibgraph.audit.result import by_unit
-from calibgraph.simulation.scan_errors import draw_scan_errors
+from tools.scenes.scan_errors import draw_scan_errors
 from tools.scenes.sensor_streets import ALIGNMENT, RIGS, aligned_rig, mean_poses, render
 
 Array = NDArray[np.float64]

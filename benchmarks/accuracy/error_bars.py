@@ -48,12 +48,12 @@ from calibgraph.model.correspondences import concatenate
 from calibgraph.model.findings import error_components
 from calibgraph.model.geometry import relative_covariance, relative_transform, twist_between
 from calibgraph.pipeline import to_calibration
-from calibgraph.simulation.scan_errors import draw_scan_errors
 from calibgraph.solver.joint import solve_joint
 from calibgraph.trust.assess import assess
 from calibgraph.trust.evidence import gather
 from calibgraph.trust.image_record import RunChecks
 from tools.scenes.lens_errors import draw_lens_errors
+from tools.scenes.scan_errors import draw_scan_errors
 from tools.scenes.sensor_streets import ALIGNMENT, RIGS, aligned_rig, mean_poses, render
 
 STREETS = 5
@@ -127,10 +127,11 @@ def render_street(
     return stated, aligned
 
 
-def calibrate_street(folder: Path, guess: Rig) -> Calibration:
+def calibrate_street(folder: Path, guess: Rig, *, interval_s: float | None = None) -> Calibration:
     """Calibrate a street, and keep the tables beside it."""
     guess.save(folder / "rig.yaml")
-    result = calibrate(load_dataset(folder), guess)
+    data = load_dataset(folder, interval_s=interval_s)
+    result = calibrate(data, data.rig)
     assert result.correspondences is not None
     result.correspondences.save(folder / "correspondences.parquet")
     if result.camera_matches is not None:

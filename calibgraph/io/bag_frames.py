@@ -112,15 +112,20 @@ def motion_by_poses(trajectory: Trajectory, frame: Frame, to_s: float) -> ScanMo
 def _by_scans(frames: Sequence[Frame], frame: Frame, to_s: float) -> ScanMotion:
     """The mean velocity from the scan before to this one, and to the one after."""
     place = next(k for k, other in enumerate(frames) if other.index == frame.index)
-    beside = [*frames[max(place - 1, 0) : place], *frames[place + 1 : place + 2]]
-    later_s = [(other, seconds_between(frame, other) or 0.0) for other in beside]
-    near = [(other, s) for other, s in later_s if 0 < abs(s) < _NEIGHBOUR_S]
+    near = scans_beside(frames, place)
     if not near:
         raise DatasetError(
             f"{frame.cloud_path}: has no scan within {_NEIGHBOUR_S} s before or after it, from "
             "which its motion could be found; choose other frames, or --motion odometry or tf"
         )
     return ScanMotion(tuple(twist_by_scans(frame, near).tolist()), to_s)
+
+
+def scans_beside(frames: Sequence[Frame], place: int) -> list[tuple[Frame, float]]:
+    """The frames before and after one whose scans are near in time, and how much later [s]."""
+    beside = [*frames[max(place - 1, 0) : place], *frames[place + 1 : place + 2]]
+    later_s = [(other, seconds_between(frames[place], other) or 0.0) for other in beside]
+    return [(other, s) for other, s in later_s if 0 < abs(s) < _NEIGHBOUR_S]
 
 
 def _odometry(bag: Bag, lidar: str, options: BagOptions) -> Iterator[tuple[int, Array]]:
@@ -217,6 +222,7 @@ def frames_of_bag(
         for name, count in others.items() if count
     )  # fmt: skip
     _, cells = np.unique(np.array(clouds.cells)[complete], return_inverse=True)
+    after_s = {n: after_ns(clouds, stamps[images[n]], pairs[n], complete) / _S for n in cameras}
     recorded = tuple(
         Frame(
             start + int(row + cell),
@@ -224,12 +230,12 @@ def frames_of_bag(
             clouds.paths[row],
             {name: stamps[images[name]].paths[pairs[name][row]] for name in cameras},
             lidar_paths={n: stamps[t].paths[pairs[n][row]] for n, t in topics.lidars.items()},
+            images_after_s={name: float(own[number]) for name, own in after_s.items()},
         )
-        for row, cell in zip(complete, cells, strict=True)
+        for number, (row, cell) in enumerate(zip(complete, cells, strict=True))
     )
     late_s = dict[str, Array]()
     if options.motion != "none":
-        after_s = {n: after_ns(clouds, stamps[images[n]], pairs[n], complete) / _S for n in cameras}
         to_s = np.median([*after_s.values()], axis=0) if after_s else np.zeros(len(complete))
         late_s = {name: own - to_s for name, own in after_s.items()}
         find = motion_finder(path, recorded, options)

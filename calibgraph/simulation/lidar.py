@@ -1,18 +1,31 @@
 """A spinning LiDAR in a simulated world."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
-from calibgraph.simulation.scan_errors import ScanErrors, bias_of_range, cast_beams
-from calibgraph.simulation.world import World, find_albedos
+from calibgraph.simulation.world import Hits, World, cast, find_albedos
 
 Points = NDArray[np.float32]
 
 _REFERENCE_M = 100.0
+
+
+class SensorErrors(Protocol):
+    """Errors of a LiDAR; experiments draw them (``tools.scenes.scan_errors``)."""
+
+    @property
+    def elevations_deg(self) -> tuple[float, ...]:
+        """True minus reported elevation of each beam; empty for none."""
+
+    def cast(self, world: World, T_world_lidar: Array, shots: Array) -> tuple[Points, Hits]:
+        """(n, 3) directions of shots in the world, and what they meet."""
+
+    def bias_m(self, brightness: Array) -> Array:
+        """(n,) bias of the ranges, by brightness as in :func:`return_chance`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,7 +43,7 @@ class Lidar:
         ring_spread: standard deviation of the beams' gains, about 1.
         dropout: share of shots that are lost at random.
         weakest: albedo at which 1 - 1/e of the shots return from 100 m at normal incidence.
-        errors: of the sensor; none for an ideal one.
+        errors: of the sensor; None for an ideal one.
     """
 
     elevations_deg: tuple[float, ...]
@@ -43,10 +56,11 @@ class Lidar:
     ring_spread: float = 0.05
     dropout: float = 0.01
     weakest: float = 0.06
-    errors: ScanErrors = ScanErrors()
+    errors: SensorErrors | None = None
 
     def __post_init__(self) -> None:
-        found, beams = len(self.errors.elevations_deg), len(self.elevations_deg)
+        beams = len(self.elevations_deg)
+        found = 0 if self.errors is None else len(self.errors.elevations_deg)
         if found not in (0, beams):
             raise ValueError(f"errors of {found} elevations for {beams} beams: one per beam, or ()")
 
@@ -97,14 +111,18 @@ def scan(
         (n, 4) x y z [m] in the LiDAR's frame and intensity in 0 to 1, in random order.
     """
     shots = shot_directions(lidar)
-    fired = shot_directions(lidar, lidar.errors.elevations_deg)
-    directions, hits = cast_beams(world, lidar.errors, T_world_lidar, fired)
+    if (errors := lidar.errors) is None:
+        directions = (shots @ T_world_lidar[:3, :3].T).astype(np.float32)
+        hits = cast(world, T_world_lidar[:3, 3], directions)
+    else:
+        fired = shot_directions(lidar, errors.elevations_deg)
+        directions, hits = errors.cast(world, T_world_lidar, fired)
     albedo, incidence = find_albedos(world, directions, hits)
     gain = np.repeat(gains, len(shots) // len(gains))
     intensity = albedo[:, 3] * (0.55 + 0.45 * incidence) * gain
     intensity += rng.normal(0, lidar.intensity_noise, len(shots))
     distance = hits.distance_m + rng.normal(0, lidar.range_noise_m, len(shots))
-    distance += bias_of_range(lidar.errors, albedo[:, 3] * incidence)
+    distance += 0.0 if errors is None else errors.bias_m(albedo[:, 3] * incidence)
     kept = (distance > lidar.min_range_m) & (distance < lidar.max_range_m)
     kept &= rng.random(len(shots)) < return_chance(lidar, albedo[:, 3] * incidence, distance)
     order = rng.permutation(np.flatnonzero(kept))

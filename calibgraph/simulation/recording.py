@@ -16,9 +16,8 @@ from calibgraph.model.metrics import perturb
 from calibgraph.model.rig import Rig
 from calibgraph.progress import Progress, no_progress
 from calibgraph.simulation.cameras import camera_rays, render
-from calibgraph.simulation.lidar import Lidar, lidar_of, ring_gains, scan
+from calibgraph.simulation.lidar import Lidar, SensorErrors, lidar_of, ring_gains, scan
 from calibgraph.simulation.mesh import Mesh
-from calibgraph.simulation.scan_errors import ScanErrors, draw_scan_errors
 from calibgraph.simulation.solids import UNIT_X, UNIT_Y, UNIT_Z, to_transform
 from calibgraph.simulation.street import (
     LANE_Y_M,
@@ -37,10 +36,9 @@ MAX_SIDE_PX, MAX_PIXELS = 16_000, 50_000_000
 _LIDAR_Z_M = 1.8
 _SWAY_DEG, _SWAY_Y_M, _SWAY_STEP = (2.0, 0.5, 0.5), 0.25, 0.15
 _JPEG_QUALITY = 92
-_MAX_ERRORS = 10.0
 _WRITTEN = ("lidar", "cameras", REFERENCE_FILE, RIG_FILE)  # rig.yaml last: it makes a dataset
 # Each has its own random stream.
-_WORLD, _DRIVE, _GAINS, _SCAN, _IMAGE, _SENSOR, _LAYOUT = range(7)
+_WORLD, _DRIVE, _GAINS, _SCAN, _IMAGE, _, _LAYOUT = range(7)
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +64,7 @@ def simulate_street(  # noqa: PLR0913 - each of its own
     seed: int = 0,
     rotation_deg: float = 5.0,
     translation_m: float = 0.3,
-    sensor_errors: float | ScanErrors = 0.0,
+    sensor_errors: SensorErrors | None = None,
     vary_layout: bool = False,
     build_scene: SceneBuilder = build_street,
     progress: Progress | None = None,
@@ -86,9 +84,7 @@ def simulate_street(  # noqa: PLR0913 - each of its own
         seed: of the street, the drive, the noise and the guess.
         rotation_deg: rotation error of the guess; see :func:`calibgraph.perturb`.
         translation_m: its translation error.
-        sensor_errors: of the LiDAR; or their size, 0 for an ideal one, 1 for what real ones have:
-            elevations of beams, width of beams, motion during a turn, ranges on dark surfaces, as
-            the seed draws them.
+        sensor_errors: of the LiDAR; None for an ideal one.
         vary_layout: draw the street's width, curves, gardens, heights and objects by the
             seed. Otherwise all streets are laid out alike: kerbs and fronts are equally far away.
         build_scene: what the road leads through, if not a street: from the line of the road, the
@@ -104,7 +100,7 @@ def simulate_street(  # noqa: PLR0913 - each of its own
         CalibrationError: if Open3D is missing.
     """
     out = Path(out)
-    lidar = replace(lidar_of(beams), errors=_draw_errors(sensor_errors, beams, seed))
+    lidar = replace(lidar_of(beams), errors=sensor_errors)
     guess = perturb(rig, rotation_deg=rotation_deg, translation_m=translation_m, seed=seed)
     _require_possible(out, rig, frames, step_m)
     progress = progress or no_progress
@@ -118,15 +114,6 @@ def simulate_street(  # noqa: PLR0913 - each of its own
         rig.save(made / REFERENCE_FILE)
         guess.save(made / RIG_FILE)
     return [out / name for name in reversed(_WRITTEN)]
-
-
-def _draw_errors(wanted: float | ScanErrors, beams: int, seed: int) -> ScanErrors:
-    if isinstance(wanted, ScanErrors):
-        return wanted
-    rng = np.random.default_rng([seed, _SENSOR])
-    if not 0 <= wanted <= _MAX_ERRORS:
-        raise ValueError(f"sensor errors of {wanted}: 0 to {_MAX_ERRORS:g} expected")
-    return draw_scan_errors(beams, wanted, rng) if wanted else ScanErrors()
 
 
 def build_drive(

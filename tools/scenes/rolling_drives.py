@@ -17,10 +17,10 @@ from calibgraph.simulation.cameras import CameraRays, camera_rays, develop, trac
 from calibgraph.simulation.lidar import lidar_of, ring_gains, scan
 from calibgraph.simulation.recording import build_drive
 from calibgraph.simulation.rigs import rig_of
-from calibgraph.simulation.scan_errors import ScanErrors
 from calibgraph.simulation.world import World
 from factors import Clock
 from tests.draws.clocks import draw_twists
+from tools.scenes.scan_errors import ScanErrors
 
 FRAMES, STEP_M, STRIP_PX = 5, 15.0, 16
 ERRORS = ScanErrors(beam_mrad=2.0, dark_m=0.02)

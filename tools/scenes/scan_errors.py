@@ -31,6 +31,36 @@ class ScanErrors:
     motion_m: float = 0.0
     dark_m: float = 0.0
 
+    def cast(
+        self, world: World, T_world_lidar: Array, shots: Array
+    ) -> tuple[NDArray[np.float32], Hits]:
+        """Cast beams of some width from a sensor that moves.
+
+        Args:
+            world: surfaces.
+            T_world_lidar: (4, 4) when the sensor looks ahead.
+            shots: (n, 3) unit vectors in the LiDAR's frame, with the errors of the elevations.
+
+        Returns:
+            (n, 3) directions in the world, and what they meet; of a wide beam the mean distance of
+            the surface that returns, and a place on it.
+        """
+        R = T_world_lidar[:3, :3]
+        origins = T_world_lidar[:3, 3]
+        if self.motion_m:
+            share_of_turn = np.arctan2(shots[:, 1], shots[:, 0]) / (2 * np.pi)
+            origins = origins + self.motion_m * share_of_turn[:, None] * R[:, 0]
+        middle = (shots @ R.T).astype(np.float32)
+        if not self.beam_mrad:
+            return middle, cast(world, origins, middle)
+        parts = [(shots + offset) @ R.T for offset in _parts_of_beam(shots, self.beam_mrad)]
+        hits = [cast(world, origins, part.astype(np.float32)) for part in parts]
+        return middle, foremost(hits)
+
+    def bias_m(self, brightness: Array) -> Array:
+        """(n,) bias of the ranges; brightness as in ``return_chance``."""
+        return np.asarray(self.dark_m * np.exp(-brightness / _BLACK))
+
 
 def draw_scan_errors(beams: int, size: float, rng: np.random.Generator) -> ScanErrors:
     """Errors of one sensor.
@@ -48,34 +78,6 @@ def draw_scan_errors(beams: int, size: float, rng: np.random.Generator) -> ScanE
         motion_m=size * rng.normal(0.0, 0.1),
         dark_m=size * rng.uniform(0.0, 0.03),
     )
-
-
-def cast_beams(
-    world: World, errors: ScanErrors, T_world_lidar: Array, shots: Array
-) -> tuple[NDArray[np.float32], Hits]:
-    """Cast beams of some width from a sensor that moves.
-
-    Args:
-        world: surfaces.
-        errors: of the sensor; its elevation errors are in the shots.
-        T_world_lidar: (4, 4) when the sensor looks ahead.
-        shots: (n, 3) unit vectors in the LiDAR's frame.
-
-    Returns:
-        (n, 3) directions in the world, and what they meet; of a wide beam the mean distance of the
-        surface that returns, and a place on it.
-    """
-    R = T_world_lidar[:3, :3]
-    origins = T_world_lidar[:3, 3]
-    if errors.motion_m:
-        share_of_turn = np.arctan2(shots[:, 1], shots[:, 0]) / (2 * np.pi)
-        origins = origins + errors.motion_m * share_of_turn[:, None] * R[:, 0]
-    middle = (shots @ R.T).astype(np.float32)
-    if not errors.beam_mrad:
-        return middle, cast(world, origins, middle)
-    parts = [(shots + offset) @ R.T for offset in _parts_of_beam(shots, errors.beam_mrad)]
-    hits = [cast(world, origins, part.astype(np.float32)) for part in parts]
-    return middle, foremost(hits)
 
 
 def _parts_of_beam(shots: Array, beam_mrad: float) -> list[Array]:
@@ -108,8 +110,3 @@ def foremost(hits: list[Hits]) -> Hits:
         triangle=np.stack([part.triangle for part in hits])[one],
         within=np.stack([part.within for part in hits])[one],
     )
-
-
-def bias_of_range(errors: ScanErrors, brightness: Array) -> Array:
-    """(n,) [m] range bias; brightness as in ``return_chance``."""
-    return np.asarray(errors.dark_m * np.exp(-brightness / _BLACK))
