@@ -12,6 +12,8 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from calibgraph.errors import CalibrationError, CorrespondenceError
 from calibgraph.io.dataset import Dataset, keep_frames, load_dataset
 from calibgraph.matching.burnt_in import hide_burnt_in
@@ -37,6 +39,7 @@ from calibgraph.matching.run import (
     require_known_motion,
     round_in_words,
     summarize_round,
+    with_delays,
     with_motion,
 )
 from calibgraph.matching.same_images import require_different_images
@@ -64,6 +67,9 @@ _log = logging.getLogger(__name__)
 _STANDS, _REPEATS = 0.5, 4
 """Change of a lens or clock, in standard deviations, from which the last round is repeated; how
 often. It is also repeated while it moves a camera that is found beyond what a PASS allows."""
+_AT_ONCE_M, _USUAL_M_S = 0.01, 10.0
+"""Way between two images from which on they show no relative pose of their cameras; the speed of a
+vehicle whose clouds were swept while it drove."""
 _BETTER = 1.03
 """Ratio of z-scores from which the end of a displaced start replaces the first end. On KITTI, ends
 8 to 12 cm off had 8 to 16 % lower z-scores than those at 3 cm; equally good ends differ by a few
@@ -313,26 +319,28 @@ def with_cameras_of(run: MatchingRun, again: MatchingRun, names: Collection[str]
 
 
 def assign_places(run: MatchingRun) -> MatchingRun:
-    """The run, solved again with the places of its frames.
+    """The run, solved again with the places of its frames, and when its points were taken.
 
-    Where the matcher's error has a part that frames of one place share. The camera with the highest
-    z-score shows where the places are.
+    Places count where the matcher's error has a part that frames of one place share. The camera
+    with the highest z-score shows where they are.
     """
-    findings, solution = run.correspondences.findings, run.solution
+    findings, solution, warnings = run.correspondences.findings, run.solution, run.warnings
     found = {name: z for name, z in findings.z_score.items() if name not in findings.missed}
-    if not findings.place_variance or not found:
-        return run
-    camera, rig, config = max(found, key=lambda n: found[n]), solution.solved_rig, solution.config
+    rig, config = solution.solved_rig, solution.config
     try:
-        groups = find_places(run.dataset, rig, camera, seed=config.seed)
-        up = find_up(run.dataset.frames[0].load_cloud(), rig.T_camera_lidar.values())
+        table = with_delays(run.correspondences, run.dataset)
+        if findings.place_variance and found:
+            camera = max(found, key=lambda name: found[name])
+            groups = find_places(run.dataset, rig, camera, seed=config.seed)
+            table = table.with_places(replace(table.places, places=as_groups(groups)))
+            up = find_up(run.dataset.frames[0].load_cloud(), rig.T_camera_lidar.values())
+            warnings = warnings if up is not None else (*warnings, UNKNOWN_UP)
     except (CalibrationError, OSError):  # the checks on images report it
         return run
-    places = replace(run.correspondences.places, places=as_groups(groups))
-    table, start = run.correspondences.with_places(places), solution.rig.with_lenses_of(run.guess)
-    pairs = solution.camera_matches
+    if table is run.correspondences:
+        return run
+    start, pairs = solution.rig.with_lenses_of(run.guess), solution.camera_matches
     solution = solve_joint(start, table, config, solution.terms, camera_matches=pairs)
-    warnings = run.warnings if up is not None else (*run.warnings, UNKNOWN_UP)
     return replace(run, correspondences=table, solution=solution, warnings=warnings)
 
 
@@ -340,7 +348,7 @@ def refine_with_camera_pairs(run: MatchingRun) -> MatchingRun:
     """Match the cameras with each other, and refine the solution with what they see in common.
 
     Not the cameras that the matcher did not find, nor a pair whose features contradict what it
-    found: they would spoil the others.
+    found: they would spoil the others. Nor two that the vehicle carries on between their images.
 
     Returns:
         The run itself where no two cameras can overlap, there is no time left, the terms do not use
@@ -354,6 +362,7 @@ def refine_with_camera_pairs(run: MatchingRun) -> MatchingRun:
             near = overlapping_pairs(solution.solved_rig, run.dataset.frames[0].load_cloud())
             other, missed = findings.contradicted, findings.missed.keys()
             pairs = [(a, b) for a, b in near if missed.isdisjoint((a, b)) and other.get(a) != b]
+            pairs = [pair for pair in pairs if _driven_between_m(run, pair) < _AT_ONCE_M]
             if not pairs:
                 return run
             matches = match_cameras(
@@ -371,6 +380,21 @@ def refine_with_camera_pairs(run: MatchingRun) -> MatchingRun:
             return replace(run, solution=add_camera_pairs(solution, matches))
     except (CalibrationError, OSError):  # the checks on images report it
         return run
+
+
+def _driven_between_m(run: MatchingRun, pair: tuple[str, str]) -> float:
+    """How far the vehicle drives between the images of two cameras, the mean over frames.
+
+    By the times of the rig or by stamps; zero if neither or no motion is known.
+    """
+    stated = [run.solution.solved_rig.cameras[name].time_offset_s for name in pair]
+    usual_m_s, ways = _USUAL_M_S if run.correspondences.is_swept else 0.0, list[float]()
+    for frame in run.dataset.frames:
+        times_s = [frame.image_after_s(name) for name in pair] if None in stated else stated
+        twist = frame.twist_per_s
+        speed_m_s = usual_m_s if twist is None else float(np.linalg.norm(twist[3:]))
+        ways.append(speed_m_s * float(np.ptp([seconds or 0.0 for seconds in times_s])))
+    return float(np.mean(ways))
 
 
 def _open(dataset: Datasets, rig: Rig | None, most_frames: int | None) -> tuple[FrameChoice, Rig]:

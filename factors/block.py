@@ -26,32 +26,27 @@ from factors.arrays import (
     check_shape,
     contiguous,
     join_roots,
-    pack_sums,
     read_only,
     rows_of_root,
     to_runs,
-    unpack_sums,
 )
 from factors.columns import CLOCK, Columns, displace
 from factors.kernel import (
     COLUMNS,
     COST,
     CURVATURE,
-    MATRICES,
+    NO_FREE,
+    NO_STEP,
+    NORMS,
     PRODUCTS,
-    RAYS,
-    SUMS,
-    accumulate,
-    evaluate,
-    summarize,
+    RESIDUALS,
+    pass_over,
 )
 from factors.lens import Lens
 from factors.pose import cauchy_noise, custom_factor, lossless_factor
 
 Array = NDArray[np.float64]
 
-_NO_STEP = contiguous(np.empty(0))
-_NO_COLUMNS = contiguous(np.empty((0, 3, 0))), np.empty(0, np.int64), np.empty(0)
 _WIDTHS = {"points_lidar_m": 3, "pixels_px": 2, "sqrt_information": 3, "motion": 7}
 
 
@@ -85,7 +80,6 @@ class ProjectionBlock(RobustBlock):
     _columns: Array = field(init=False, repr=False)  # (5, n) x y z u v, or (12, n) with the motion
     _whitening: Array = field(init=False, repr=False)  # (3, n), (1, n) or (0, n), see the kernel
     _whole: NDArray[np.int64] = field(init=False, repr=False)  # (1, 2) the run of all
-    _has_rays: bool = field(init=False, repr=False)  # whether RAYS serves, if no point is too near
 
     def __post_init__(self) -> None:
         n = len(self.points_lidar_m)
@@ -106,7 +100,6 @@ class ProjectionBlock(RobustBlock):
             _columns=columns,
             _whitening=columns[:0] if root is None else root[:rows],
             _whole=to_runs(np.array([0, columns.shape[1]])),
-            _has_rays=rows < MATRICES and self.lens.is_undistorted_pinhole,
             points_lidar_m=columns[:3].T,
             pixels_px=columns[3:5].T,
             motion=columns[5:].T if len(columns) > 5 else None,  # noqa: PLR2004
@@ -148,13 +141,15 @@ class ProjectionBlock(RobustBlock):
 
     def sums(self, T_lidar_camera: gtsam.Pose3) -> BlockSums:
         """H, b and c of the whole block at a pose, in one pass over the data."""
-        sums = self.packed_run_sums(_T_camera_lidar(T_lidar_camera)[None], self._whole)
-        return unpack_sums(sums[0])
+        sums = self.summarize(_T_camera_lidar(T_lidar_camera))
+        return BlockSums(sums.hessian[0], sums.gradient[0], sums.cost[0])
 
     def costs_at_each(self, T_camera_lidar: Array) -> Array:
         """(p,) c of the whole block at each of (p, 4, 4) poses."""
-        runs = np.tile(self._whole, (len(T_camera_lidar), 1))
-        return self.packed_run_sums(T_camera_lidar, runs, wanted=COST)[:, 27]
+        runs = self._whole.repeat(len(T_camera_lidar), axis=0)
+        sums = np.zeros((len(runs), 1, 8, 7))
+        self._pass_over(T_camera_lidar, COST, sums, runs=runs)
+        return sums[:, 0, 7, 0]
 
     def summarize(
         self,
@@ -163,37 +158,64 @@ class ProjectionBlock(RobustBlock):
         free: Columns | None = None,
         values: Array | None = None,
         *,
-        step: Array = _NO_STEP,
+        scales: Array | None = None,
+        step: Array = NO_STEP,
         curvature: bool = False,
     ) -> BlockSums:
         """H, b and c of each run by pose and further columns, stacked, and sums of the weights.
 
         Args:
             T_camera_lidar: (r, 4, 4) of each run, or (1, 4, 4).
-            runs: (r, 2) as in :meth:`run_sums`; None: one run of all.
+            runs: (r, 2) its first correspondence, and the one behind its last; None: one run.
             free: k columns beside the pose; their lens is the block's, too. Without a motion, a
                 clock is not observable.
             values: (k,) of these; None: zeros.
+            scales: (r,) of the loss in each run, in place of ``scale``.
             step: (6 + k,) of pose and columns: the residuals are those after so much of it, to
                 first order.
             curvature: whether the second derivative of half the cost is wanted, too.
         """
-        runs = self._whole if runs is None else runs
-        size, variance = 6 + (0 if free is None else len(free)), self.sigma**2
+        runs, size = self._whole if runs is None else runs, 6 + (0 if free is None else len(free))
         sums = np.zeros((len(runs), 2 if curvature else 1, size + 2, size + 1))
         wanted = CURVATURE if curvature else PRODUCTS
-        self._summarize(T_camera_lidar, runs, wanted, sums, free=free, values=values, step=step)
-        whole = sums[:, :, : size + 1] / variance
-        whole += np.triu(whole, 1).swapaxes(-1, -2)
-        hessian = whole[:, 0, :size, :size]
-        return BlockSums(
-            hessian,
-            whole[:, 0, :size, size],
-            sums[:, 0, -1, 0] / variance,
-            hessian - whole[:, 1, :size, :size] if curvature else None,
-            weights=sums[:, 0, -1, 1],
-            squares=whole[:, 0, size, size],
+        self._pass_over(
+            T_camera_lidar,
+            wanted,
+            sums,
+            free,
+            values,
+            runs=runs,
+            scales=scales,
+            step=contiguous(step),
         )
+        return _unpack(sums)
+
+    def fit(
+        self,
+        T_camera_lidar: Array,
+        runs: NDArray[np.int64],
+        scales: Array | None = None,
+        *,
+        tolerance: float,
+    ) -> tuple[Array, BlockSums, NDArray[np.bool_]]:
+        """Minimize the robust cost of each run by itself, by Levenberg-Marquardt.
+
+        Args:
+            T_camera_lidar: (r, 4, 4) starts, or (1, 4, 4).
+            runs: (r, 2) as above.
+            scales: (r,) as above.
+            tolerance: relative decrease of the cost at which a run is done.
+
+        Returns:
+            (r, 4, 4) minima; the sums there; (r,) which ended by the tolerance.
+        """
+        sums, moved = np.zeros((len(runs), 1, 8, 7)), np.empty((len(runs), 4, 4))
+        ended = np.empty(len(runs), np.bool_)
+        self._pass_over(
+            T_camera_lidar, PRODUCTS, sums, runs=runs, scales=scales, tolerance=tolerance,
+            moved=moved, flags=ended,
+        )  # fmt: skip
+        return moved, _unpack(sums), ended
 
     def columns(
         self, T_camera_lidar: Array, free: Columns | None = None, values: Array | None = None
@@ -207,31 +229,57 @@ class ProjectionBlock(RobustBlock):
             free: k columns beside the pose.
             values: (k,) of these; None: zeros.
         """
-        found = np.empty((1, 7 + (0 if free is None else len(free)), 2, len(self)))
-        self._summarize(T_camera_lidar[None], self._whole, COLUMNS, found, free=free, values=values)
-        return np.asarray(found[0] / self.sigma)
+        found = np.empty((7 + (0 if free is None else len(free)), 2, len(self)))
+        self._pass_over(T_camera_lidar[None], COLUMNS, found, free, values)
+        return found
 
-    def _summarize(
+    def residuals(
+        self, T_camera_lidar: Array, runs: NDArray[np.int64] | None = None
+    ) -> tuple[Array, NDArray[np.bool_]]:
+        """(n, 2) unweighted residuals ``pi - u`` [px]; (n,) whether the point is projectable.
+
+        Args:
+            T_camera_lidar: (r, 4, 4) of each run, or (1, 4, 4).
+            runs: (r, 2) as of the sums, which hold every point once; None: one run.
+        """
+        residuals, valid = np.empty((len(self), 2)), np.empty(len(self), np.bool_)
+        self._pass_over(T_camera_lidar, RESIDUALS, residuals, runs=runs, flags=valid)
+        return residuals, valid
+
+    def run_norms(
+        self, T_camera_lidar: Array, runs: NDArray[np.int64] | None = None, *, factor: float = 1.0
+    ) -> Array:
+        """(2, n) norms of the unweighted [px] and of the whitened residuals, times a factor.
+
+        One row if there is no whitening; infinite where a point is not projectable. The whitened
+        ones are not divided by sigma. Arguments as of :meth:`residuals`.
+        """
+        norms = np.empty((1 if len(self._whitening) == 0 else 2, len(self)))
+        valid = np.empty(len(self), np.bool_)
+        self._pass_over(T_camera_lidar, NORMS, norms, runs=runs, factor=factor, flags=valid)
+        return norms
+
+    def _pass_over(
         self,
         T_camera_lidar: Array,
-        runs: NDArray[np.int64],
         wanted: int,
         out: Array,
-        *,
-        scales: Array | None = None,
         free: Columns | None = None,
         values: Array | None = None,
-        step: Array = _NO_STEP,
+        *,
+        scales: Array | None = None,
+        **rest: Any,
     ) -> None:
-        lens, columns, (moves, numbers, units) = self.lens, self._columns, _NO_COLUMNS
+        lens, columns, packed = self.lens, self._columns, NO_FREE
         if free is not None:
             lens = free.lens if values is None else free.at(values)
             columns = self._columns_at(free, np.zeros(len(free)) if values is None else values)
-            moves = contiguous(free.displacements(columns[:3], columns[4], columns[5:11]))
-            numbers, units = free.packed
-        summarize(lens.kind)(
-            lens.packed, contiguous(T_camera_lidar), columns, moves, self._whitening,
-            self._scales(scales), contiguous(runs), numbers, units, contiguous(step), wanted, out,
+            moves = free.displacements(columns[:3], columns[4], columns[5:11])
+            packed = *free.packed, contiguous(moves)
+        scales = np.array([self.scale]) if scales is None else scales
+        pass_over(
+            lens.kind, lens.packed, T_camera_lidar, columns, wanted, out,
+            whitening=self._whitening, scales=scales, sigma=self.sigma, free=packed, **rest,
         )  # fmt: skip
 
     def _columns_at(self, free: Columns, values: Array) -> Array:
@@ -244,87 +292,19 @@ class ProjectionBlock(RobustBlock):
         points = displace(self.points_lidar_m, self.motion[:, :6], late)
         return read_only(np.concatenate([points.T, self._columns[3:]]))
 
-    def run_sums(
-        self, T_camera_lidar: Array, runs: NDArray[np.int64], scales: Array | None = None
-    ) -> BlockSums:
-        """H, b and c of each run of the correspondences at a pose of its own, stacked.
 
-        Args:
-            T_camera_lidar: (r, 4, 4) of each run, or (1, 4, 4).
-            runs: (r, 2) its first correspondence, and the one behind its last.
-            scales: (r,) of the loss in each run, in place of ``scale``.
-        """
-        return unpack_sums(self.packed_run_sums(T_camera_lidar, runs, scales))
-
-    def packed_run_sums(
-        self,
-        T_camera_lidar: Array,
-        runs: NDArray[np.int64],
-        scales: Array | None = None,
-        *,
-        wanted: int = PRODUCTS,
-    ) -> Array:
-        """(r, 28) as :meth:`run_sums`: 21 of the upper triangle of H, 6 of b, 1 of c."""
-        sums = np.empty((len(runs), SUMS))
-        if self._has_rays:
-            accumulate(
-                self.lens.packed, contiguous(T_camera_lidar), self._columns, self._whitening,
-                self._scales(scales), contiguous(runs), wanted, sums,
-            )  # fmt: skip
-        if not self._has_rays or np.isnan(sums[:, 27]).any():
-            products = np.zeros((len(runs), 1, 8, 7))
-            self._summarize(T_camera_lidar, runs, wanted, products, scales=scales)
-            sums = pack_sums(products[:, 0])
-        return sums if self.sigma == 1.0 else sums / self.sigma**2
-
-    def _scales(self, scales: Array | None) -> Array:
-        """Of the loss, which has rho(s / sigma^2; delta) = rho(s; delta sigma) / sigma^2."""
-        return np.array([self.scale * self.sigma]) if scales is None else scales * self.sigma
-
-    def residuals(self, T_lidar_camera: gtsam.Pose3) -> tuple[Array, NDArray[np.bool_]]:
-        """(n, 2) unweighted residuals ``pi - u`` [px]; (n,) whether the point is projectable."""
-        return self.run_residuals(_T_camera_lidar(T_lidar_camera)[None], self._whole)
-
-    def run_residuals(
-        self, T_camera_lidar: Array, runs: NDArray[np.int64]
-    ) -> tuple[Array, NDArray[np.bool_]]:
-        """As :meth:`residuals`, with a pose for each run; the runs hold every point once.
-
-        Args:
-            T_camera_lidar: (r, 4, 4) of each run, or (1, 4, 4).
-            runs: (r, 2) as in :meth:`run_sums`.
-        """
-        residuals = np.empty((len(self), 2))
-        return residuals, self._evaluate(T_camera_lidar, runs, residuals)
-
-    def run_norms(
-        self, T_camera_lidar: Array, runs: NDArray[np.int64] | None = None, *, factor: float = 1.0
-    ) -> Array:
-        """(2, n) norms of the unweighted [px] and of the whitened residuals, times a factor.
-
-        One row if there is no whitening; infinite where a point is not projectable.
-
-        Args:
-            T_camera_lidar: (r, 4, 4) of each run, or (1, 4, 4).
-            runs: (r, 2) as in :meth:`run_residuals`; None: one run.
-            factor: by which both are multiplied.
-        """
-        norms = np.empty((1 if len(self._whitening) == 0 else 2, len(self)))
-        runs = self._whole if runs is None else runs
-        self._evaluate(T_camera_lidar, runs, norms, factor)
-        return norms
-
-    def _evaluate(
-        self, T_camera_lidar: Array, runs: NDArray[np.int64], out: Array, factor: float = 0.0
-    ) -> NDArray[np.bool_]:
-        """Fill in residuals, or norms times a factor; (n,) whether each point is projectable."""
-        valid = np.empty(len(self), np.bool_)
-        kind = RAYS if self.lens.is_undistorted_pinhole else self.lens.kind
-        evaluate(kind)(
-            self.lens.packed, contiguous(T_camera_lidar), self._columns, self._whitening,
-            factor, contiguous(runs), out, valid,
-        )  # fmt: skip
-        return valid
+def _unpack(sums: Array) -> BlockSums:
+    """From (r, 1 to 2, 8 + k, 7 + k) sums of the kernel."""
+    size = sums.shape[-1] - 1
+    hessian = sums[:, 0, :size, :size]
+    return BlockSums(
+        hessian,
+        sums[:, 0, :size, size],
+        sums[:, 0, -1, 0],
+        hessian - sums[:, 1, :size, :size] if sums.shape[1] > 1 else None,
+        weights=sums[:, 0, -1, 1],
+        squares=sums[:, 0, size, size],
+    )
 
 
 def block_factor(key: int, block: ProjectionBlock) -> gtsam.CustomFactor:
@@ -416,4 +396,5 @@ def projection_factor(
 
 
 def _T_camera_lidar(T_lidar_camera: gtsam.Pose3) -> Array:
-    return contiguous(T_lidar_camera.inverse().matrix())
+    """(1, 4, 4)."""
+    return contiguous(T_lidar_camera.inverse().matrix())[None]

@@ -1,4 +1,4 @@
-"""The compiled passes over correspondences: sums of the block factor, residuals, columns.
+"""The compiled pass over correspondences: sums of the block factor, residuals, columns, fits.
 
 Points come as columns (structure of arrays). A run of correspondences is cut into tiles of a few
 hundred, whose intermediate values stay in the cache, with one quantity in each row, so that the
@@ -6,13 +6,9 @@ compiler vectorizes the loops over it. Three things would keep it from that: an 
 negative, hence those without a sign, an entry that a row may overlap, hence what is taken out
 before a loop, and Python's exception on a division by zero, hence ``error_model="numpy"``.
 
-There is a kernel per kind of lens, whose number is a constant in it: the branches of other lenses
-are not compiled. RAYS is a kind, too.
-
-    accumulate   c, or H, b and c by the pose of RAYS, in a fifth of the time
-    summarize    the same of any lens, by the pose and further columns, with the second derivative
-                 of the cost; or the columns themselves
-    evaluate     residuals or their norms
+There is one kernel per kind of lens, whose number is a constant in it: the branches of other lenses
+are not compiled. Of an undistorted pinhole without whitening matrices, sums by the pose are made
+from x/z, y/z and 1/z, in a fifth of the time.
 
 The loss is Cauchy's, rho(s) = k log(1 + s / k) with the square k of a scale, and psi = rho' is
 1 / (1 + s / k); of an infinite scale it is s. The second derivative of rho(s) / 2 is
@@ -25,10 +21,13 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from factors.arrays import contiguous, read_only
 from factors.compiled import compiled
 from factors.lens_kernels import (
     FISHEYE,
+    LIMIT,
     MIN_DEPTH_M,
     OMNIDIRECTIONAL,
     PINHOLE,
@@ -37,6 +36,9 @@ from factors.lens_kernels import (
     project_one,
     project_radtan,
 )
+from factors.pose_kernel import DAMPING, MAX_DAMPING, MAX_STEPS, judge, move, solve_damped
+
+Array = NDArray[np.float64]
 
 FAST = {"reassoc", "contract", "nsz", "arcp"}
 """The arithmetic that LLVM may assume; NaN and infinity keep their meaning."""
@@ -55,13 +57,9 @@ ROWS = 12
 MATRICES = 3
 """Rows of the whitening if it is matrices; 1 if it is numbers, 0 if there is none."""
 
-RAYS = -1
-"""In place of a kind of lens: an undistorted pinhole."""
-
-COST, COLUMNS, PRODUCTS, CURVATURE = range(4)
-"""What is wanted: c alone; columns; their products, H and b; the second derivative, too."""
-SUMS = 28
-"""How many sums the pose has: 21 of H, 6 of b, 1 of c."""
+RESIDUALS, NORMS, COLUMNS, COST, PRODUCTS, CURVATURE = range(6)
+"""What is wanted: residuals; their norms; columns; c alone; products of the columns, H and b; the
+second derivative, too."""
 
 FOCAL, ASPECT, CENTRE_X, CENTRE_Y, DISPLACED, P1, P2 = range(7)
 """Columns beside the pose: of a lens, or of what displaces the points; the radial coefficient k of
@@ -70,119 +68,169 @@ a power is P2 plus the power."""
 WIDTH = 2 * TILE + 8
 """Of rows with u and then v; those of 4096 bytes would share cache lines."""
 
+NO_STEP = read_only(np.empty(0))
+NO_FREE = read_only(np.empty(0, np.int64)), NO_STEP, read_only(np.empty((0, 3, 0)))
+_NO_WHITENING, _ONE = read_only(np.empty((0, 0))), read_only(np.ones(1))
+_NO_POSES, _NO_FLAGS = np.empty((0, 4, 4)), np.empty(0, np.bool_)
 _SMALL = 1e-100  # far from the smallest float by more than four factors
 
 
-@compiled(fastmath=FAST)
-def accumulate(lens, poses, columns, whitening, scales, runs, wanted, out):  # type: ignore[no-untyped-def]
-    """Fill (r, SUMS) sums of RAYS over the runs ``runs[i, 0]:runs[i, 1]``.
+def pass_over(  # noqa: PLR0913 - the arguments of the kernel
+    kind: int,
+    lens: Array,
+    T_camera_lidar: Array,
+    columns: Array,
+    wanted: int,
+    out: Array,
+    *,
+    runs: NDArray[np.int64] | None = None,
+    whitening: Array = _NO_WHITENING,
+    scales: Array = _ONE,
+    sigma: float = 1.0,
+    free: tuple[NDArray[np.int64], Array, Array] = NO_FREE,
+    step: Array = NO_STEP,
+    factor: float = 1.0,
+    tolerance: float = 0.0,
+    moved: Array = _NO_POSES,
+    flags: NDArray[np.bool_] = _NO_FLAGS,
+) -> None:
+    """Fill ``out`` with what is wanted of each of (r, 2) runs of correspondences.
 
-    ``poses`` (r, 4, 4) are T_camera_lidar and ``scales`` (r,) the loss', each of one run, or
-    (1, 4, 4) and (1,) of all; ``columns`` (5, n) are x y z u v; ``whitening`` is (1, n): numbers;
-    or (0, n): none. c is NaN for a run with a point that is too near: it is another kernel's.
+    Args:
+        kind: of the lens.
+        lens: (13,) its parameters.
+        T_camera_lidar: (r, 4, 4) of each run, or (1, 4, 4).
+        columns: (5 or more, n) x y z u v.
+        wanted: RESIDUALS to CURVATURE.
+        out: (n, 2) residuals pi - u [px]; (1 or 2, n) their norms, plain and whitened, times
+            ``factor``, infinite where a point is not projectable; (7 + k, 2, n) whitened columns
+            and last the residuals; or zeros (r, 1 to 2, 8 + k, 7 + k) for the sums: of each run H,
+            b in the last column and the sum of psi s in the corner; below, c and the sum of psi;
+            then, if there is room, - sum 2 psi' t t^T.
+        runs: first correspondence, and the one behind the last; None: one run. Of residuals and
+            norms, they hold every point once.
+        whitening: (3, n) triangular matrices, (1, n) numbers, or (0, n).
+        scales: (r,) of the loss of each run, or (1,).
+        sigma: what whitened residuals are divided by; scales are multiples of it.
+        free: (k,) columns beside the pose, (k,) their units, and (m, 3, n) the displacements of the
+            points in the LiDAR frame by those that displace them.
+        step: (6 + k,) displaces the residuals by so much of the columns; or empty.
+        factor: of norms.
+        tolerance: relative decrease of the cost at which a fit is done.
+        moved: (r, 4, 4) is filled with the poses at which the cost of each run is least, and sums
+            are those there; of size zero: they are at the given ones.
+        flags: (n,) is filled with whether each point is projectable; of a fit, (r,) whether it
+            ended by the tolerance.
     """
-    tile = np.empty((ROWS, TILE))
-    for i in range(len(runs)):
-        T, scale = poses[i if len(poses) > 1 else 0], scales[i if len(scales) > 1 else 0]
-        sums = out[i]
-        for k in range(SUMS):
-            sums[k] = 0.0
-        for start in range(runs[i, 0], runs[i, 1], TILE):
-            n = min(TILE, runs[i, 1] - start)
-            if not project_rays(lens, T, columns, start, n, tile):
-                sums[27] = math.nan
-            ru, rv, psi = tile[RU], tile[RV], tile[PSI]
-            for k in range(n if len(whitening) else 0):
-                w = whitening[0, np.uint64(start + k)]
-                ru[k] *= w
-                rv[k] *= w
-            sums[27] += weigh(scale, n, ru, rv, psi)
-            if wanted == COST:
-                continue
-            for k in range(n):
-                ru[k] *= psi[k]
-                rv[k] *= psi[k]
-            for k in range(n if len(whitening) else 0):
-                w = whitening[0, np.uint64(start + k)]
-                ru[k] *= w
-                rv[k] *= w
-                psi[k] *= w * w
-            sum_rays(lens, n, tile, sums)
-            sum_ray_gradients(lens, n, tile, sums)
+    if runs is None:
+        runs = np.array([[0, columns.shape[1]]])
+    numbers, units, moves = free
+    _kernel(kind)(
+        lens, contiguous(T_camera_lidar), columns, whitening, contiguous(runs), contiguous(scales),
+        sigma, numbers, units, moves, step, wanted, factor, tolerance,
+        out.reshape((1,) * (4 - out.ndim) + out.shape), moved, flags,
+    )  # fmt: skip
 
 
 @cache
-def summarize(kind: int) -> Any:
-    """The kernel of sums by pose and further columns over runs of correspondences."""
-
+def _kernel(kind: int) -> Any:
     @compiled(fastmath=FAST)
-    def summarize_runs(  # type: ignore[no-untyped-def]
-        lens, poses, columns, moves, whitening, scales, runs, free, units, step, wanted, out
-    ):
-        """Fill products of columns, or the columns.
-
-        The first arguments as of ``accumulate``; ``whitening`` may be (3, n): triangular matrices.
-        ``free`` (k,) are the columns beside the pose, in ``units`` (k,); ``moves`` (m, 3, n) are
-        the displacements of the points in the LiDAR frame by those that displace them. ``step``
-        (6 + k,) displaces the residuals by so much of the columns, or is empty. ``out``
-        (1, 7 + k, 2, n): the columns and last the residuals; or (r, 1 to 2, 8 + k, 7 + k): of each
-        run H, b in the last column and the sum of psi s in the corner, in the upper triangle, and
-        below it c and the sum of psi; then, if there is room, - sum 2 psi' t t^T.
-        """
+    def pass_over_runs(  # type: ignore[no-untyped-def]
+        lens, poses, columns, whitening, runs, scales, sigma, free, units, moves, step, wanted,
+        factor, tolerance, out, moved, flags,
+    ):  # fmt: skip
+        """See ``pass_over``; ``out`` has four axes."""
         size = 7 + len(free)
         rows, bends, tile = np.empty((size, WIDTH)), np.empty((size, TILE)), np.empty((ROWS, TILE))
+        tried, sums, work = np.empty((2, 4, 4)), np.empty((2, size + 1, size)), np.empty((8, 6))
+        has_rays = kind == PINHOLE and math.isinf(lens[LIMIT]) and len(whitening) < MATRICES
+        has_rays = has_rays and (wanted < COLUMNS or (COST <= wanted <= PRODUCTS and size == 7))  # noqa: PLR2004
         for run in range(len(runs)):
-            T, scale = poses[run if len(poses) > 1 else 0], scales[run if len(scales) > 1 else 0]
-            for start in range(runs[run, 0], runs[run, 1], TILE):
-                n = min(TILE, runs[run, 1] - start)
-                if kind == PINHOLE:
-                    project_pinhole(lens, T, columns, start, n, tile)
-                else:
-                    project(kind, lens, T, columns, start, n, tile)
-                if wanted != COST:
+            best, new, damping = -1, 0, DAMPING
+            scale = sigma * scales[run if len(scales) > 1 else 0]
+            copy(poses[run if len(poses) > 1 else 0], tried[0])
+            for _ in range(1 + MAX_STEPS if len(moved) else 1):
+                T, found = tried[new], out[run if wanted >= COST else 0, 0]
+                found = sums[new] if len(moved) else found
+                for i in range(size + 1 if len(moved) else 0):
+                    for k in range(size):
+                        found[i, k] = 0.0
+                for start in range(runs[run, 0], runs[run, 1], TILE):
+                    n = min(TILE, runs[run, 1] - start)
+                    as_rays = has_rays and project_rays(lens, T, columns, start, n, tile)
+                    inside = as_rays
+                    if kind == PINHOLE and not as_rays:
+                        inside = project_pinhole(lens, T, columns, start, n, tile)
+                    if kind != PINHOLE:
+                        project(kind, lens, T, columns, start, n, tile)
+                    if wanted < COLUMNS:
+                        for k in range(n):
+                            flags[start + k] = inside or is_projectable(
+                                kind, lens, tile[X, k], tile[Y, k], tile[Z, k]
+                            )
+                            if wanted == RESIDUALS:
+                                out[0, 0, start + k, 0] = tile[RU, k]
+                                out[0, 0, start + k, 1] = tile[RV, k]
+                        if wanted == NORMS:
+                            fill_norms(whitening, start, n, tile, factor, flags, out[0, 0])
+                        continue
+                    if as_rays:
+                        add_rays(lens, whitening, scale, start, n, wanted, tile, found)
+                        continue
                     fill_rows(n, tile, rows)
                     if len(free):
                         fill_columns(
                             kind, lens, T, columns, moves, start, n, free, units, tile, rows
                         )
-                residuals = rows[size - 1]
-                for i in range(n):
-                    residuals[i], residuals[np.uint64(n + i)] = tile[RU, i], tile[RV, i]
-                if len(whitening):
-                    whiten(whitening, start, n, rows, size - 1 if wanted == COST else 0)
-                if wanted == COLUMNS:
-                    for k in range(size):
-                        for i in range(n):
-                            out[0, k, 0, start + i] = rows[k, i]
-                            out[0, k, 1, start + i] = rows[k, n + i]
-                    continue
-                for k in range(len(step)):
-                    for i in range(2 * n):
-                        residuals[i] += step[k] * rows[k, i]
-                psi, sums = tile[PSI], out[run, 0]
-                sums[size, 0] += weigh(scale, n, residuals, residuals[n:], psi)
-                if wanted == COST:
-                    continue
-                if wanted == CURVATURE:
-                    fill_bends(scale, n, psi, rows, bends)
-                    add_products(n, bends, out[run, 1])
-                total = 0.0
-                for i in range(n):
-                    total += psi[i]
-                    psi[i] = math.sqrt(psi[i])
-                sums[size, 1] += total
-                for k in range(size):
-                    for i in range(n):
-                        rows[k, i] *= psi[i]
-                        rows[k, np.uint64(n + i)] *= psi[i]
-                add_products(2 * n, rows, sums)
+                    if len(whitening):
+                        whiten(whitening, start, n, rows)
+                    if wanted == COLUMNS:
+                        for k in range(size):
+                            for i in range(n):
+                                out[0, k, 0, start + i] = rows[k, i] / sigma
+                                out[0, k, 1, start + i] = rows[k, n + i] / sigma
+                        continue
+                    residuals = rows[size - 1]
+                    for k in range(len(step)):
+                        for i in range(2 * n):
+                            residuals[i] += step[k] * rows[k, i]
+                    psi = tile[PSI]
+                    found[size, 0] += weigh(scale, n, residuals, residuals[n:], psi)
+                    if wanted == CURVATURE:
+                        fill_bends(scale, n, psi, rows, bends)
+                        add_products(n, bends, out[run, 1])
+                    if wanted != COST:
+                        add_weighted(n, psi, rows, found)
+                if not len(moved):
+                    break
+                best, damping, is_done = judge(sums, best, new, work, damping, tolerance)
+                flags[run] = is_done and damping < MAX_DAMPING
+                if is_done:
+                    break
+                new = 1 - best
+                solve_damped(sums[best], damping, work)
+                move(-1.0, work[6], tried[best], tried[new])
+            if len(moved):
+                copy(tried[best], moved[run])
+                copy(sums[best], out[run, 0])
+            if wanted >= COST:
+                for part in range(out.shape[1]):
+                    complete(sigma, out[run, part])
 
-    return summarize_runs
+    return pass_over_runs
+
+
+@compiled(part=True)
+def copy(of, to):  # type: ignore[no-untyped-def]
+    """Copy a matrix; an assignment to a slice compiles for half a second."""
+    for i in range(len(of)):
+        for k in range(of.shape[1]):
+            to[i, k] = of[i, k]
 
 
 @compiled(part=True, fastmath=FAST)
 def fill_rows(n, tile, rows):  # type: ignore[no-untyped-def]
-    """Derivatives of u and v by the pose.
+    """Derivatives of u and v by the pose, and last the residuals.
 
     q = X^-1 p has dq / d(rotation, translation) = ([q]x, -I), and g^T [q]x = (g x q)^T.
     """
@@ -193,6 +241,9 @@ def fill_rows(n, tile, rows):  # type: ignore[no-untyped-def]
             rows[0, at], rows[1, at] = gy[i] * z - gz[i] * y, gz[i] * x - gx[i] * z
             rows[2, at] = gx[i] * y - gy[i] * x
             rows[3, at], rows[4, at], rows[5, at] = -gx[i], -gy[i], -gz[i]
+    residuals = rows[len(rows) - 1]
+    for i in range(n):
+        residuals[i], residuals[np.uint64(n + i)] = tile[RU, i], tile[RV, i]
 
 
 @compiled(part=True, fastmath=FAST)
@@ -269,6 +320,21 @@ def fill_bends(scale, n, psi, rows, bends):  # type: ignore[no-untyped-def]
 
 
 @compiled(part=True, fastmath=FAST)
+def add_weighted(n, psi, rows, sums):  # type: ignore[no-untyped-def]
+    """Add the products of rows, weighted, and the weights."""
+    total = 0.0
+    for i in range(n):
+        total += psi[i]
+        psi[i] = math.sqrt(psi[i])
+    sums[len(rows), 1] += total
+    for k in range(len(rows)):
+        for i in range(n):
+            rows[k, i] *= psi[i]
+            rows[k, np.uint64(n + i)] *= psi[i]
+    add_products(2 * n, rows, sums)
+
+
+@compiled(part=True, fastmath=FAST)
 def add_products(length, rows, out):  # type: ignore[no-untyped-def]
     """Add the products of all pairs of rows to an upper triangle."""
     for i in range(len(rows)):
@@ -281,9 +347,9 @@ def add_products(length, rows, out):  # type: ignore[no-untyped-def]
 
 
 @compiled(part=True, fastmath=FAST)
-def whiten(whitening, start, n, rows, first):  # type: ignore[no-untyped-def]
-    """Multiply rows of u and v, from the first on, by the whitening matrices, or by numbers."""
-    for k in range(first, len(rows)):
+def whiten(whitening, start, n, rows):  # type: ignore[no-untyped-def]
+    """Multiply rows of u and v by the whitening matrices, or by numbers."""
+    for k in range(len(rows)):
         row = rows[k]
         for i in range(n):
             at, behind = np.uint64(start + i), np.uint64(n + i)
@@ -324,50 +390,8 @@ def weigh(scale, n, ru, rv, psi):  # type: ignore[no-untyped-def]
     return -(logarithms + math.log(a) + math.log(b) + math.log(c) + math.log(d)) / k
 
 
-@cache
-def evaluate(kind: int) -> Any:
-    """The kernel of the residuals, or their norms, of runs."""
-    lens_kind = PINHOLE if kind == RAYS else kind
-
-    @compiled(fastmath=FAST)
-    def evaluate_runs(lens, poses, columns, whitening, factor, runs, out, valid):  # type: ignore[no-untyped-def]
-        """Fill residuals or norms, and (n,) whether each point is projectable.
-
-        ``lens`` to ``whitening`` and ``runs`` as of the sums; the runs hold every point once.
-        ``out`` (n, 2) are the residuals pi - u [px]; or, of a factor > 0, (1 or 2, n) their norms,
-        plain and whitened, times the factor, infinite where a point is not projectable.
-        """
-        tile = np.empty((ROWS, TILE))
-        for run in range(len(runs)):
-            T = poses[run if len(poses) > 1 else 0]
-            for start in range(runs[run, 0], runs[run, 1], TILE):
-                n = min(TILE, runs[run, 1] - start)
-                inside = False
-                if kind == RAYS:
-                    inside = project_rays(lens, T, columns, start, n, tile)
-                if lens_kind != PINHOLE:
-                    project(kind, lens, T, columns, start, n, tile)
-                elif not inside:
-                    inside = project_pinhole(lens, T, columns, start, n, tile)
-                for k in range(n):
-                    valid[start + k] = inside or is_projectable(
-                        lens_kind, lens, tile[X, k], tile[Y, k], tile[Z, k]
-                    )
-                if factor > 0.0:
-                    fill_norms(whitening, start, n, tile, factor, out)
-                    for k in range(0 if inside else n):
-                        if not valid[start + k]:
-                            for row in range(len(out)):  # a slice compiles for half a second
-                                out[row, start + k] = math.inf
-                else:
-                    for k in range(n):
-                        out[start + k, 0], out[start + k, 1] = tile[RU, k], tile[RV, k]
-
-    return evaluate_runs
-
-
 @compiled(part=True, fastmath=FAST)
-def fill_norms(whitening, start, n, tile, factor, norms):  # type: ignore[no-untyped-def]
+def fill_norms(whitening, start, n, tile, factor, seen, norms):  # type: ignore[no-untyped-def]
     """Fill in the norms of a tile's residuals times a factor, plain and whitened."""
     ru, rv = tile[RU], tile[RV]
     for i in range(n):
@@ -380,6 +404,10 @@ def fill_norms(whitening, start, n, tile, factor, norms):  # type: ignore[no-unt
             u = whitening[0, at] * ru[i] + whitening[1, at] * rv[i]
             v = whitening[2, at] * rv[i]
             norms[1, at] = factor * math.sqrt(u * u + v * v)
+    for i in range(start, start + n):
+        if not seen[i]:
+            for row in range(len(norms)):  # a slice compiles for half a second
+                norms[row, i] = math.inf
 
 
 @compiled(part=True, fastmath=FAST)
@@ -465,8 +493,52 @@ def project_pinhole(lens, T, columns, start, n, tile):  # type: ignore[no-untype
 
 
 @compiled(part=True, fastmath=FAST)
-def sum_rays(lens, n, tile, out):  # type: ignore[no-untyped-def]
-    """Add the 21 sums of H of a tile of a pinhole, from a = x/z, b = y/z, w = 1/z, psi and psi r.
+def complete(sigma, sums):  # type: ignore[no-untyped-def]
+    """Fill in the lower triangle, and divide by the variance."""
+    size = len(sums) - 1
+    for i in range(size):
+        for j in range(i, size):
+            sums[i, j] /= sigma * sigma
+            sums[j, i] = sums[i, j]
+    sums[size, 0] /= sigma * sigma
+
+
+@compiled(part=True, fastmath=FAST)
+def add_rays(lens, whitening, scale, start, n, wanted, tile, sums):  # type: ignore[no-untyped-def]
+    """Add the sums of a tile of an undistorted pinhole, whose weights are numbers."""
+    ru, rv, psi = tile[RU], tile[RV], tile[PSI]
+    for k in range(n if len(whitening) else 0):
+        w = whitening[0, np.uint64(start + k)]
+        ru[k] *= w
+        rv[k] *= w
+    sums[7, 0] += weigh(scale, n, ru, rv, psi)
+    if wanted == COST:
+        return
+    weights = squares = 0.0
+    for k in range(n):
+        weights += psi[k]
+        squares += psi[k] * (ru[k] * ru[k] + rv[k] * rv[k])
+        ru[k] *= psi[k]
+        rv[k] *= psi[k]
+    sums[6, 6] += squares
+    sums[7, 1] += weights
+    for k in range(n if len(whitening) else 0):
+        w = whitening[0, np.uint64(start + k)]
+        ru[k] *= w
+        rv[k] *= w
+        psi[k] *= w * w
+    products, pulls = sum_rays(lens, n, tile), sum_ray_gradients(lens, n, tile)
+    row = column = 0
+    for k in range(21):
+        sums[row, column] += products[k]
+        row, column = (row, column + 1) if column < 5 else (row + 1, row + 1)  # noqa: PLR2004
+    for k in range(6):
+        sums[k, 6] += pulls[k]
+
+
+@compiled(part=True, fastmath=FAST)
+def sum_rays(lens, n, tile):  # type: ignore[no-untyped-def]
+    """The 21 sums of H of a tile of a pinhole, from a = x/z, b = y/z, w = 1/z, psi and psi r.
 
     The rows of the Jacobian are fx (ab, -A, b, -w, 0, aw) and fy (B, -ab, -a, 0, -w, bw) with
     A = 1 + a^2 and B = 1 + b^2: their 21 products share most of their terms, and the focal lengths
@@ -510,19 +582,17 @@ def sum_rays(lens, n, tile, out):  # type: ignore[no-untyped-def]
         v55 += psi * bw * bw
     fx, fy = lens[0], lens[1]
     p, q = fx * fx, fy * fy
-    sums = (
+    return (
         p * u00 + q * v00, -p * u01 - q * v01, p * u02 - q * v02, -p * u03, -q * v04,
         p * u05 + q * v05, p * u11 + q * u00, -p * u12 + q * v12, p * u13, q * u03,
         -p * u15 - q * v15, p * u22 + q * v22, -p * u23, q * v24, (p - q) * u03,
         p * u33, 0.0, -p * u35, q * u33, -q * v45, p * u55 + q * v55,
     )  # fmt: skip
-    for k in range(21):
-        out[k] += sums[k]
 
 
 @compiled(part=True, fastmath=FAST)
-def sum_ray_gradients(lens, n, tile, out):  # type: ignore[no-untyped-def]
-    """Add the gradient of a tile of a pinhole to the sums, see ``sum_rays``."""
+def sum_ray_gradients(lens, n, tile):  # type: ignore[no-untyped-def]
+    """The gradient of a tile of a pinhole, see ``sum_rays``."""
     pull_u, pull_v = tile[RU], tile[RV]
     ray_a, ray_b, ray_w = tile[A], tile[B], tile[W]
     fx, fy = lens[0], lens[1]
@@ -536,6 +606,4 @@ def sum_ray_gradients(lens, n, tile, out):  # type: ignore[no-untyped-def]
         b3 -= w * u
         b4 -= w * v
         b5 += w * both
-    sums = (b0, b1, b2, b3, b4, b5)
-    for k in range(6):
-        out[21 + k] += sums[k]
+    return b0, b1, b2, b3, b4, b5

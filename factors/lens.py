@@ -13,22 +13,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import lru_cache
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from factors.arrays import contiguous
-from factors.compiled import compiled
-from factors.lens_kernels import (
-    FISHEYE,
-    LIMIT,
-    OMNIDIRECTIONAL,
-    PINHOLE,
-    is_projectable,
-    project_one,
-)
+from factors.kernel import COLUMNS, RESIDUALS, pass_over
+from factors.lens_kernels import FISHEYE, LIMIT, OMNIDIRECTIONAL, PINHOLE
 
 Array = NDArray[np.float64]
 LensModel = Literal["pinhole", "fisheye", "omnidirectional"]
@@ -45,9 +38,9 @@ ORDERS: dict[LensModel, str] = {
     "omnidirectional": "[xi, k1, k2, p1, p2]",
 }
 """The distortion coefficients of each model in their order, which is OpenCV's."""
-_NO_JACOBIANS, _NO_VALIDITY = np.empty((0, 6)), np.empty(0, np.bool_)
+_IDENTITY = np.eye(4)[None]
 _MAX_PLANE_RADIUS = math.tan(math.radians(85.0))  # polynomials are not fitted beyond
-_TABLE = 500
+_TABLE, _MOST_AHEAD = 500, math.radians(89.9)
 _MAX_XI = 100.0  # beyond, the model is a parallel projection, whose focal length is not determined
 _ITERATIONS = 20  # of Newton; 3 to 6 are enough but near the limit of a lens
 _CONVERGED_PX = 1e-10
@@ -94,37 +87,44 @@ class Lens:
         return Lens(kind, np.array(packed, dtype=np.float64))
 
     @property
-    def is_undistorted_pinhole(self) -> bool:
-        """Whether its pixels are linear in x/z and y/z; it has no limit then."""
-        return self.kind == PINHOLE and math.isinf(self.packed[LIMIT])
-
-    @property
     def pixels_per_rad(self) -> float:
         """Resolution along u on the camera's axis [px/rad]."""
         fx = float(self.packed[0])
         return fx / (1.0 + float(self.packed[4])) if self.kind == OMNIDIRECTIONAL else fx
 
-    def project(self, points_camera_m: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:
+    def project(
+        self, points_m: ArrayLike, T_camera_points: Array | None = None
+    ) -> tuple[Array, NDArray[np.bool_]]:
         """Project points.
 
         Args:
-            points_camera_m: (n, 3) in the camera frame.
+            points_m: (n, 3).
+            T_camera_points: (4, 4) of their frame; None: they are in the camera frame.
 
         Returns:
             (n, 2) pixels, and (n,) whether each is a real projection (in front of the camera and
             inside the injective domain of the lens). It may still lie outside the image.
         """
-        points = contiguous(np.asarray(points_camera_m, dtype=np.float64).reshape(-1, 3))
-        pixels, valid = np.empty((len(points), 2)), np.empty(len(points), np.bool_)
-        _project_many(self.kind)(self.packed, points, pixels, valid, _NO_JACOBIANS)
+        columns = _columns(points_m)
+        T = _IDENTITY if T_camera_points is None else T_camera_points[None]
+        pixels, valid = np.empty((columns.shape[1], 2)), np.empty(columns.shape[1], np.bool_)
+        pass_over(self.kind, self.packed, T, columns, RESIDUALS, pixels, flags=valid)
         return pixels, valid
 
     def project_with_jacobian(self, points_camera_m: ArrayLike) -> tuple[Array, Array]:
         """Project points: (n, 2) pixels, and their (n, 2, 3) derivatives by the points."""
-        points = contiguous(np.asarray(points_camera_m, dtype=np.float64).reshape(-1, 3))
-        pixels, jacobians = np.empty((len(points), 2)), np.empty((len(points), 6))
-        _project_many(self.kind)(self.packed, points, pixels, _NO_VALIDITY, jacobians)
-        return pixels, jacobians.reshape(-1, 2, 3)
+        columns = _columns(points_camera_m)
+        found = np.empty((7, 2, columns.shape[1]))
+        pass_over(self.kind, self.packed, _IDENTITY, columns, COLUMNS, found)
+        return found[6].T, -found[3:6].T
+
+
+def _columns(points_m: ArrayLike) -> Array:
+    """(5, n) columns of points at the pixel (0, 0)."""
+    points = np.asarray(points_m, dtype=np.float64).reshape(-1, 3)
+    columns = np.zeros((5, len(points)))
+    columns[:3] = points.T
+    return contiguous(columns)
 
 
 def _checked(fx: float, fy: float, distortion: Sequence[float], model: LensModel) -> Array:
@@ -170,23 +170,6 @@ def _fisheye_limit(coefficients: tuple[float, ...]) -> float:
     return min(math.sqrt(_smallest_positive_root(slope)), math.radians(179.0))
 
 
-@cache
-def _project_many(kind: int) -> Any:
-    @compiled()
-    def run(lens, points, pixels, valid, jacobians):  # type: ignore[no-untyped-def]
-        """Fill in (n, 2) pixels, (n,) validity and (n, 6) derivatives, where there is room."""
-        for k in range(len(points)):
-            x, y, z = points[k, 0], points[k, 1], points[k, 2]
-            if len(valid):
-                valid[k] = is_projectable(kind, lens, x, y, z)
-            projection = project_one(kind, lens, x, y, z)
-            pixels[k, 0], pixels[k, 1] = projection[0], projection[1]
-            for place in range(6 if len(jacobians) else 0):
-                jacobians[k, place] = projection[2 + place]
-
-    return run
-
-
 def check_mirror(xi: float) -> None:
     """Check the unified model's xi: 0 is a pinhole, 1 a parabolic mirror, more a fisheye.
 
@@ -220,21 +203,6 @@ _KINDS: dict[LensModel, tuple[int, Callable[[tuple[float, ...]], float]]] = {
     "omnidirectional": (OMNIDIRECTIONAL, _omnidirectional_limit),
 }
 """The kind of each model, and the limit of its domain by its coefficients."""
-
-
-def _first_omnidirectional_rays(packed: Array, points: Array) -> Array:
-    """(n, 3) unit rays of points (n, 2) on the plane, but for the tangential distortion.
-
-    Args:
-        packed: parameters of the lens.
-        points: distorted, in focal lengths from the principal point.
-    """
-    xi, k1, k2 = packed[4:7]
-    angle = np.linspace(0.0, packed[12], _TABLE)
-    radius = np.sin(angle) / (np.cos(angle) + xi)
-    found = np.interp(np.hypot(*points.T), radius * (1 + radius**2 * (k1 + radius**2 * k2)), angle)
-    sideways = np.sin(found) / np.maximum(np.hypot(*points.T), np.finfo(float).tiny)
-    return np.column_stack([points * sideways[:, None], np.cos(found)])
 
 
 def unproject(lens: Lens, pixels_px: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:
@@ -281,16 +249,14 @@ def _right_inverse(jacobians: Array) -> Array:
 
 
 def _first_rays(lens: Lens, pixels: Array) -> Array:
-    """(n, 3) rays without distortion."""
+    """(n, 3) rays by a table of the radius over the angle, as if there were no tangential terms."""
     fx, fy, cx, cy = lens.packed[:4]
-    x, y = (pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy
-    if lens.kind == OMNIDIRECTIONAL:
-        return _first_omnidirectional_rays(lens.packed, np.column_stack([x, y]))
-    radius = np.hypot(x, y)
-    if lens.kind == FISHEYE:
-        angle = np.minimum(radius, 0.9 * lens.packed[-1])
-        sideways = np.sin(angle) / np.maximum(radius, np.finfo(float).tiny)
-        return np.column_stack([x * sideways, y * sideways, np.cos(angle)])
-    inside = np.minimum(1.0, lens.packed[-1] / np.maximum(radius, np.finfo(float).tiny))
-    rays = np.column_stack([x * inside, y * inside, np.ones(len(x))])
-    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+    plane = np.column_stack([(pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy])
+    limit = lens.packed[LIMIT]
+    angle = np.linspace(0.0, math.atan(limit) if lens.kind == PINHOLE else limit, _TABLE)
+    angle = np.minimum(angle, _MOST_AHEAD if lens.kind == PINHOLE else math.inf)
+    along = lens.project(np.column_stack([np.sin(angle), np.zeros(_TABLE), np.cos(angle)]))[0]
+    radius = np.hypot(*plane.T)
+    found = np.interp(radius, np.maximum.accumulate((along[:, 0] - cx) / fx), angle)
+    sideways = np.sin(found) / np.maximum(radius, np.finfo(float).tiny)
+    return np.column_stack([plane * sideways[:, None], np.cos(found)])

@@ -110,7 +110,7 @@ def camera_prior_factor(
 
     Exactly, not to first order: with X = T^-1 the stock prior's error is
     ``log(T_hat X) = -Ad(T_hat) log(T_hat^-1 T)``, so its covariance must be Ad(T_hat) Ad(T_hat)^T
-    / lambda.
+    / lambda, and the root of its information Ad(T_hat)^-1 sqrt(lambda).
 
     Args:
         key: the pose variable ``T_lidar_camera``.
@@ -118,8 +118,8 @@ def camera_prior_factor(
         weight: lambda > 0.
     """
     mean = gtsam.Pose3(np.asarray(T_camera_lidar, dtype=np.float64))
-    adjoint = mean.AdjointMap()
-    noise = gtsam.noiseModel.Gaussian.Covariance(adjoint @ adjoint.T / weight)
+    root = weight**0.5 * mean.inverse().AdjointMap()
+    noise = gtsam.noiseModel.Gaussian.SqrtInformation(root)
     return gtsam.PriorFactorPose3(key, mean.inverse(), noise)
 
 

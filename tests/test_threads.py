@@ -69,10 +69,10 @@ def test_another_thread_goes_on_while_a_kernel_runs() -> None:
     lens = Lens.of("pinhole", fx=700.0, fy=700.0, cx=600.0, cy=200.0)
     block = ProjectionBlock(lens, points, lens.project(points)[0], scale=2.0)
     runs, T = np.tile([0, len(points)], (40, 1)), np.eye(4)[None]
-    block.run_sums(T, runs[:1])  # compiled
+    block.summarize(T, runs[:1])  # compiled
     with ThreadPoolExecutor(1) as pool:
         start = last = time.perf_counter()
-        running, longest = pool.submit(block.run_sums, T, runs), 0.0
+        running, longest = pool.submit(block.summarize, T, runs), 0.0
         while not running.done():
             now = time.perf_counter()
             longest, last = max(longest, now - last), now

@@ -127,10 +127,11 @@ def render_street(
     return stated, aligned
 
 
-def calibrate_street(folder: Path, guess: Rig) -> Calibration:
+def calibrate_street(folder: Path, guess: Rig, *, interval_s: float | None = None) -> Calibration:
     """Calibrate a street, and keep the tables beside it."""
     guess.save(folder / "rig.yaml")
-    result = calibrate(load_dataset(folder), guess)
+    data = load_dataset(folder, interval_s=interval_s)
+    result = calibrate(data, data.rig)
     assert result.correspondences is not None
     result.correspondences.save(folder / "correspondences.parquet")
     if result.camera_matches is not None:

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
-from calibgraph.model.geometry import invert, relative_transform, to_T_lidar_camera
+from calibgraph.model.geometry import invert, relative_transform
 from calibgraph.model.rig import Rig
 from calibgraph.solver.matches import CameraBlock, camera_blocks
 from calibgraph.solver.two_pass import Transforms
@@ -69,7 +69,7 @@ def _minimize_pass(
 
 def _weighted_residuals(matches: CameraBlock, T_camera_lidar: Array) -> Array:
     """(n, 2) w (pi(T p) - u) [px]."""
-    residuals, _ = matches.block.residuals(to_T_lidar_camera(T_camera_lidar))
+    residuals, _ = matches.block.residuals(T_camera_lidar[None])
     root = matches.block.sqrt_information
     if root is None:
         return residuals

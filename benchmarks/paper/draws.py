@@ -29,6 +29,7 @@ from calibgraph.progress import no_progress
 from calibgraph.rounds import match_in_rounds
 from calibgraph.simulation.rigs import rig_of
 from calibgraph.solver.joint import solve_joint
+from calibgraph.solver.matches import camera_blocks
 from calibgraph.solver.preprocess import preprocess
 from calibgraph.solver.stage1 import Stage1, estimate_stage1
 from calibgraph.solver.two_pass import Transforms
@@ -169,7 +170,8 @@ class Draw:
         key = config.confidence_min
         if key not in self._stage1:
             kept = preprocess(self.rig, self.table, config).table
-            self._stage1[key] = estimate_stage1(self.rig, kept, config)
+            blocks = camera_blocks(self.rig, kept, config)
+            self._stage1[key] = estimate_stage1(self.rig, blocks, config)
         return self._stage1[key]
 
     def aggregate_pnp(self, how: str) -> Transforms:

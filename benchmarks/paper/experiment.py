@@ -15,7 +15,6 @@ import numpy as np
 from benchmarks.paper.draws import METHODS, TRF_TERMS, Source, run_methods
 from calibgraph.errors import CorrespondenceError
 from calibgraph.model.config import Config
-from calibgraph.model.geometry import to_T_lidar_camera
 from calibgraph.model.metrics import evaluate
 from calibgraph.solver.matches import camera_blocks
 
@@ -97,7 +96,7 @@ def run_draw(source: Source, task: tuple[int, int], *, config: Config, trf: bool
         metrics = {name: {metric: abs(value) for metric, value in asdict(error).items()}
                    for name, error in {**errors.cameras, **kept}.items()}  # fmt: skip
         for name, block in blocks.items():
-            residuals, _ = block.block.residuals(to_T_lidar_camera(T[name]))
+            residuals, _ = block.block.residuals(T[name][None])
             metrics[name][REPROJECTION] = float(np.median(np.hypot(*residuals.T)))
         found[row] = metrics, seconds
     return found

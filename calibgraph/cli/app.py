@@ -21,7 +21,7 @@ import typer
 
 from calibgraph.cli.audit import check, drift
 from calibgraph.cli.calibrate import calibrate, match, solve, track
-from calibgraph.cli.inspect import doctor, evaluate, export, perturb, report, simulate, weights
+from calibgraph.cli.inspect import doctor, evaluate, export, perturb, report, simulate
 from calibgraph.cli.rig import rig
 from calibgraph.cli.serve import fleet, pick, serve
 
@@ -65,7 +65,7 @@ def _options(
 
 COMMANDS: tuple[Callable[..., None], ...] = (
     calibrate, check, drift, rig, doctor, match, solve, report, evaluate, export, track, pick,
-    simulate, perturb, weights, fleet, serve,
+    simulate, perturb, fleet, serve,
 )  # fmt: skip
 """In the order of the help."""
 for _command in COMMANDS:

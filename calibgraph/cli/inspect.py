@@ -1,4 +1,4 @@
-"""The commands report, evaluate, perturb, doctor, weights, export and simulate."""
+"""The commands report, evaluate, perturb, doctor, export and simulate."""
 
 from __future__ import annotations
 
@@ -131,30 +131,6 @@ def doctor(
             print_line(line)
     if not found.healthy:
         raise typer.Exit(1)
-
-
-def weights(
-    file: Path = Argument(..., metavar="FILE", help="Weights, .tar or .safetensors."),
-    out: Path | None = Option(None, metavar="FILE", help="Convert to this .safetensors file."),
-    as_json: options.JsonOption = False,
-    force: options.Force = False,
-) -> None:
-    """Check a file of CMRNext weights, print what is in it, and convert it to safetensors."""
-    from calibgraph.files import require_new_file
-
-    if out is not None:
-        require_new_file(out, ".safetensors", force=force)
-    from calibgraph.matching.cmrnext import load_checkpoint
-
-    checkpoint = load_checkpoint(file)
-    if out is not None:
-        checkpoint.save_safetensors(out)
-    if as_json:
-        print_json(checkpoint.summary())
-    else:
-        from calibgraph.report.tables import print_weights
-
-        print_weights(terminal(), checkpoint.summary(), out)
 
 
 _FORMATS = "; ".join(f"{name}: {meaning}" for name, meaning in EXPORT_FORMATS.items()) + "."

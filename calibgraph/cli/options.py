@@ -194,13 +194,14 @@ IntervalS = Annotated[
     Option(
         metavar="SECONDS",
         help="Time between neighbouring clouds of a folder: the motion of the LiDAR is found by "
-        "their registration. For --estimate offset or readout. (default: unknown)",
+        "their registration. For --estimate offset or readout, and to correct clouds whose points "
+        "have times. (default: unknown)",
     ),
 ]
 MatcherName = Annotated[
     str, Option(metavar="NAME|FILE", help="structure, cmrnext, or a table of correspondences.")
 ]
-_WEIGHTS = "Networks of cmrnext, .tar or .safetensors; repeat it in the order in which they run."
+_WEIGHTS = "Networks of cmrnext (iter1.tar); repeat it in the order in which they run."
 Weights = Annotated[list[Path] | None, Option(metavar="FILE", help=_WEIGHTS)]
 TimeLimitS = Annotated[
     float | None,

@@ -20,7 +20,6 @@ class RareSettings(StrictNumbers):
         device: of Torch, for cmrnext; the GPU if there is one, if null.
         iterations: of each network's recurrent update; 12 if null.
         half_resolution: whether cmrnext halves the images; from 1400 px width on, if null.
-        batch: images per batch; 1 on a CPU and 4 on a GPU, if null.
     """
 
     terms: Terms = "full"
@@ -29,7 +28,6 @@ class RareSettings(StrictNumbers):
     device: Literal["auto", "cpu", "cuda"] | None = None
     iterations: Annotated[int, Field(ge=1, le=1000)] | None = None
     half_resolution: bool | None = None
-    batch: Annotated[int, Field(ge=1)] | None = None
 
     @property
     def of_bags(self) -> dict[str, Any]:
@@ -39,7 +37,7 @@ class RareSettings(StrictNumbers):
     @property
     def of_cmrnext(self) -> dict[str, Any]:
         """Those of the matcher cmrnext that are given."""
-        names = ("device", "iterations", "half_resolution", "batch")
+        names = ("device", "iterations", "half_resolution")
         values = {name: getattr(self, name) for name in names}
         return {name: value for name, value in values.items() if value is not None}
 

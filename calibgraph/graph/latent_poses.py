@@ -112,10 +112,7 @@ class BlockByPlace:
             T_camera_cloud: (P, 4, 4) of all places.
             values: (k,) of the columns.
         """
-        T, runs = np.ascontiguousarray(T_camera_cloud), to_runs(self.edges)
-        if self.free is None:
-            return self.block.run_sums(T, runs)
-        return self.block.summarize(T, runs, self.free, values)
+        return self.block.summarize(T_camera_cloud, to_runs(self.edges), self.free, values)
 
     def factor(self, place: int, keys: Sequence[int]) -> gtsam.NonlinearFactor:
         """The correspondences of one place, lossless, on cloud, camera and columns there."""

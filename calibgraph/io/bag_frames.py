@@ -29,7 +29,7 @@ from calibgraph.io.bags.stamps import (
     read_messages,
 )
 from calibgraph.io.bags.storage import ODOMETRY, BagOptions, Motion
-from calibgraph.io.bags.topics import RigTopics, choose_topics
+from calibgraph.io.bags.topics import RigTopics, choose_topics, is_rectified
 from calibgraph.io.bags.transforms import (
     MOVING,
     Transforms,
@@ -112,15 +112,20 @@ def motion_by_poses(trajectory: Trajectory, frame: Frame, to_s: float) -> ScanMo
 def _by_scans(frames: Sequence[Frame], frame: Frame, to_s: float) -> ScanMotion:
     """The mean velocity from the scan before to this one, and to the one after."""
     place = next(k for k, other in enumerate(frames) if other.index == frame.index)
-    beside = [*frames[max(place - 1, 0) : place], *frames[place + 1 : place + 2]]
-    later_s = [(other, seconds_between(frame, other) or 0.0) for other in beside]
-    near = [(other, s) for other, s in later_s if 0 < abs(s) < _NEIGHBOUR_S]
+    near = scans_beside(frames, place)
     if not near:
         raise DatasetError(
             f"{frame.cloud_path}: has no scan within {_NEIGHBOUR_S} s before or after it, from "
             "which its motion could be found; choose other frames, or --motion odometry or tf"
         )
     return ScanMotion(tuple(twist_by_scans(frame, near).tolist()), to_s)
+
+
+def scans_beside(frames: Sequence[Frame], place: int) -> list[tuple[Frame, float]]:
+    """The frames before and after one whose scans are near in time, and how much later [s]."""
+    beside = [*frames[max(place - 1, 0) : place], *frames[place + 1 : place + 2]]
+    later_s = [(other, seconds_between(frames[place], other) or 0.0) for other in beside]
+    return [(other, s) for other, s in later_s if 0 < abs(s) < _NEIGHBOUR_S]
 
 
 def _odometry(bag: Bag, lidar: str, options: BagOptions) -> Iterator[tuple[int, Array]]:
@@ -217,6 +222,7 @@ def frames_of_bag(
         for name, count in others.items() if count
     )  # fmt: skip
     _, cells = np.unique(np.array(clouds.cells)[complete], return_inverse=True)
+    after_s = {n: after_ns(clouds, stamps[images[n]], pairs[n], complete) / _S for n in cameras}
     recorded = tuple(
         Frame(
             start + int(row + cell),
@@ -224,12 +230,12 @@ def frames_of_bag(
             clouds.paths[row],
             {name: stamps[images[name]].paths[pairs[name][row]] for name in cameras},
             lidar_paths={n: stamps[t].paths[pairs[n][row]] for n, t in topics.lidars.items()},
+            images_after_s={name: float(own[number]) for name, own in after_s.items()},
         )
-        for row, cell in zip(complete, cells, strict=True)
+        for number, (row, cell) in enumerate(zip(complete, cells, strict=True))
     )
     late_s = dict[str, Array]()
     if options.motion != "none":
-        after_s = {n: after_ns(clouds, stamps[images[n]], pairs[n], complete) / _S for n in cameras}
         to_s = np.median([*after_s.values()], axis=0) if after_s else np.zeros(len(complete))
         late_s = {name: own - to_s for name, own in after_s.items()}
         find = motion_finder(path, recorded, options)
@@ -250,15 +256,16 @@ def _read(
 ) -> tuple[dict[str, TopicStamps], Counter[str]]:
     """The stamps of clouds and images by topic, and how many lenses of a camera are other ones."""
     stamps = {t: TopicStamps() for t in (topics.lidar, *topics.paired.values())}
-    infos = {c.info: (n, c) for n, c in topics.cameras.items() if c.info and bag.has(c.info)}
+    infos = {info: name for name, info in topics.infos.items() if bag.has(info)}
     first, others = dict[str, StatedLens](), Counter[str]()
     for cell, message in read_messages(bag, [*stamps], options.every_s, infos):
         if message.topic in stamps:
             stamps[message.topic].add(message, cell, bag, options.stamps)
             continue
-        name, camera = infos[message.topic]
+        name = infos[message.topic]
         with suppress(FileError):  # some drivers begin with zeros
-            lens = lens_of(message.content, f"{bag.path}", rectified=camera.rectified)
+            rectified = is_rectified(topics.images[name])
+            lens = lens_of(message.content, f"{bag.path}", rectified=rectified)
             others[name] += not lens.agrees(first.setdefault(name, lens))
     return stamps, others
 
@@ -315,7 +322,7 @@ def _summary(
 
 
 def _paired(topics: RigTopics) -> str:
-    kinds = ["images"] * bool(topics.cameras) + ["clouds of other LiDARs"] * bool(topics.lidars)
+    kinds = ["images"] * bool(topics.images) + ["clouds of other LiDARs"] * bool(topics.lidars)
     return " and ".join(kinds)
 
 

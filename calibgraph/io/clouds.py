@@ -110,12 +110,18 @@ def time_fields(names: Iterable[str]) -> list[str]:
     return [name for name in names if name in TIMES]
 
 
-def seconds_after(stamp_ns: int, times: NDArray[Any], where: str) -> NDArray[np.float64]:
-    """Times of points [s] after a stamp.
+def seconds_after(stamp_ns: int | None, times: NDArray[Any], where: str) -> NDArray[np.float64]:
+    """Times of points [s] after a stamp; of stamps after the first, if it is None.
 
     They are whole numbers of nanoseconds after it (Ouster, Livox), seconds after it (Velodyne), or
     float64 stamps of their own, in seconds (Hesai, RoboSense) or nanoseconds.
     """
+    if stamp_ns is None:
+        first, unit = (
+            times.min(initial=np.inf),
+            1 if times.max(initial=0) > _NANOSECOND_STAMPS else 1e9,
+        )
+        stamp_ns = int(first * unit) if times.dtype.kind == "f" and first > _STAMPS else 0
     if times.dtype.kind in "iu":
         seconds = times.astype(np.float64) / 1e9
     elif times.max(initial=0.0) > _NANOSECOND_STAMPS:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import uuid
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial
 from pathlib import Path
@@ -29,8 +29,8 @@ from calibgraph.io.clouds import (
     with_intensity,
 )
 from calibgraph.io.dataset_folders import folder_layout, frames_of_folder, published_folder
-from calibgraph.io.frame import Frame, Kept, twist_by_scans
-from calibgraph.io.frame_files import way_out
+from calibgraph.io.frame import Frame, Kept, ScanMotion, twist_by_scans
+from calibgraph.io.frame_files import stated_stamps, way_out
 from calibgraph.io.rigs import describe_rig, read_rig
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.parallel import KeyedCache
@@ -197,13 +197,48 @@ def _frames_of_files(
     found, pairing = frames_of_folder(
         path, [*rig.cameras], lidars=rig.all_lidars, complete=complete, sync_tolerance_s=tolerance_s
     )
+    stamps_ns = stated_stamps(path, len(found)) if rig.other_lidars else [None] * len(found)
     frames = tuple(
-        replace(each, index=start + n, name=prefix + each.name, columns=rig.cloud_columns)
+        replace(
+            each,
+            index=start + n,
+            name=prefix + each.name,
+            recorded_ns=stamps_ns[n],
+            columns=rig.cloud_columns,
+        )
         for n, each in enumerate(found)
         if not pairing or rig.cameras.keys() <= each.image_paths.keys()
     )
-    frames = frames if interval_s is None else _driven(frames, interval_s)
-    return FoundFrames(frames, frames, (pairing,) if pairing else ())
+    late_s, notes = dict[str, Array](), [pairing] if pairing else []
+    if interval_s is not None:
+        frames = _driven(frames, interval_s)
+        if frames and (sweep := frames[0].load_sweep()) is not None:
+            frames, late_s = _corrected(frames, rig.cameras, sweep[1])
+            notes.append(f"{path}: clouds are corrected for motion by the times of their points")
+    return FoundFrames(frames, frames, tuple(notes), late_s)
+
+
+def _corrected(
+    frames: Sequence[Frame], cameras: Collection[str], times_s: Array
+) -> tuple[tuple[Frame, ...], dict[str, Array]]:
+    """Driven frames at the median stamp of their images, and how much later each image is.
+
+    Where files do not state it, at the middle of (n,) times of points.
+    """
+    after_s = np.array([[frame.image_after_s(n) for n in cameras] for frame in frames], np.float64)
+    to_s, late_s = np.full(len(frames), (times_s.min() + times_s.max()) / 2), dict[str, Array]()
+    if after_s.size and np.isfinite(after_s).all():
+        to_s = np.median(after_s, axis=1)
+        late_s = dict(zip(cameras, (after_s - to_s[:, None]).T, strict=True))
+    corrected = tuple(
+        replace(frame, find_motion=cache(partial(_motion_to, frame, float(s))))
+        for frame, s in zip(frames, to_s, strict=True)
+    )
+    return corrected, late_s
+
+
+def _motion_to(frame: Frame, to_s: float) -> ScanMotion:
+    return ScanMotion(tuple(np.asarray(frame.twist_per_s).tolist()), to_s)
 
 
 def _driven(frames: Sequence[Frame], interval_s: float) -> tuple[Frame, ...]:

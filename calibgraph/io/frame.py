@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Hashable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -98,6 +99,7 @@ def register(target: PreparedScan, source: PreparedScan, where: Path) -> Array:
     return T
 
 
+_INSTANT_S = 0.003  # in which all points of a cloud count as taken at once
 _MOST_M_S = 100.0  # of a vehicle
 _MOTION = "motion"
 """The key of an entry's :class:`ScanMotion`, if its cloud is corrected."""
@@ -129,6 +131,9 @@ class Frame:
         twist: (6,) of the LiDAR, in place of one that is computed.
         lidar_paths: the clouds of other LiDARs of this instant, by name.
         burnt_in: per camera, what its images are filled at when they are loaded.
+        recorded_ns: its stamp, where its name is none.
+        images_after_s: per camera, by how much its image is after the stamp, where no names of
+            files state it.
         columns: names of those of a .bin cloud, if the rig states them.
         arrays: the cloud and images by their paths, which are names, if they are in memory.
         kept: gray images, the cloud and what derives of them, which may then not be written to.
@@ -146,6 +151,8 @@ class Frame:
     twist: Array | None = field(default=None, kw_only=True, compare=False)
     lidar_paths: Mapping[str, Path] = field(default_factory=dict, kw_only=True)
     burnt_in: Mapping[str, BurntIn] = field(default_factory=dict, kw_only=True, compare=False)
+    recorded_ns: int | None = field(default=None, kw_only=True)
+    images_after_s: Mapping[str, float] = field(default_factory=dict, kw_only=True, compare=False)
     columns: tuple[str, ...] | None = field(default=None, kw_only=True)
     arrays: Mapping[Path, NDArray[Any]] = field(
         default_factory=dict, kw_only=True, compare=False, repr=False
@@ -168,7 +175,9 @@ class Frame:
 
     @property
     def stamp_ns(self) -> int | None:
-        """The stamp that names it; None if another name does."""
+        """The stamp that names it, or that is stated beside it; None without."""
+        if self.recorded_ns is not None:
+            return self.recorded_ns
         stem = self.name.rpartition("/")[2]
         return int(stem) if self.cloud_path.suffix == MESSAGE_SUFFIX else stamp_ns_in_name(stem)
 
@@ -191,6 +200,9 @@ class Frame:
             found = with_intensity(load_bag_cloud(path, motion.correct if motion else None))
         else:
             found = self.arrays[path] if path in self.arrays else load_cloud(path, self.columns)
+            times_s = None if motion is None else self.load_recorded("", timed=True)[1]
+            if motion is not None and times_s is not None:
+                found[:, :3] = motion.correct(found[:, :3], times_s)
         return thin_cloud(found)
 
     def load_recorded(self, lidar: str, *, timed: bool) -> tuple[Array, Array | None]:
@@ -204,9 +216,30 @@ class Frame:
         else:
             found = read_returns(path, self.columns if path == self.cloud_path else None)
             cloud = found.points
-            if timed and found.times is not None and self.stamp_ns is not None:
+            if timed and found.times is not None:
                 times_s = seconds_after(self.stamp_ns, found.times, str(path))
         return cloud[:, :3].astype(np.float64), times_s
+
+    def load_sweep(self) -> tuple[Array, Array] | None:
+        """(n, 3) the points and (n,) their times [s] after the stamp; None of one instant.
+
+        That is of a cloud that is corrected for motion, or whose points have no times.
+        """
+        if self.find_motion or self.cloud_path in self.arrays:
+            return None
+        with suppress(DatasetError):  # numbers that are no times of one scan
+            points, times_s = self.load_recorded("", timed=True)
+            if times_s is not None and np.ptp(times_s) > _INSTANT_S:
+                return points, times_s
+        return None
+
+    def image_after_s(self, camera: str) -> float | None:
+        """By how much an image is after the stamp, as their names or messages have it."""
+        if camera in self.images_after_s:
+            return self.images_after_s[camera]
+        path, stamp_ns = self.image_paths.get(camera), self.stamp_ns
+        taken_ns = None if path is None else stamp_ns_in_name(path.stem)
+        return None if taken_ns is None or stamp_ns is None else (taken_ns - stamp_ns) / 1e9
 
     def describe_cloud(self) -> list[str]:
         """Notes about its cloud; none if it cannot be read, which is named where it is loaded."""
@@ -271,10 +304,12 @@ class Frame:
             "cloud": str(self.cloud_path),
             "images": {name: str(path) for name, path in self.image_paths.items()},
         }
+        if self.lidar_paths:
+            files["lidars"] = {name: str(path) for name, path in self.lidar_paths.items()}
         if self.columns is not None:
             files[_COLUMNS] = list(self.columns)
         motion = self.motion
-        if self.find_twist is not None:
+        if motion is None and self.find_twist is not None:
             motion = ScanMotion(tuple(np.asarray(self.twist_per_s).tolist()), 0.0)
         if motion is not None:
             files[_MOTION] = {"twist_per_s": list(motion.twist_per_s), "to_s": motion.to_s}
@@ -353,12 +388,13 @@ def seconds_between(one: Frame, other: Frame) -> float | None:
 def frame_of_entry(entry: Mapping[str, Any]) -> Frame:
     """The frame that a result's entry names, its cloud corrected as it was."""
     images = {name: Path(path) for name, path in entry["images"].items()}
+    lidars = {name: Path(path) for name, path in entry.get("lidars", {}).items()}
     files = entry["frame"], entry["name"], Path(entry["cloud"]), images
     motion, columns = entry.get(_MOTION), entry.get(_COLUMNS)
     if motion is None:
-        return Frame(*files, columns=columns)
+        return Frame(*files, lidar_paths=lidars, columns=columns)
     found = ScanMotion(tuple(motion["twist_per_s"]), motion["to_s"])
-    return Frame(*files, find_motion=lambda: found, columns=columns)
+    return Frame(*files, find_motion=lambda: found, lidar_paths=lidars, columns=columns)
 
 
 def hash_source(path: Path) -> str:

@@ -19,6 +19,7 @@ from calibgraph.model.camera_matches import COLUMNS, FORMAT, NAMES, NUMBERS, PLA
 from calibgraph.model.correspondences import (
     COORDINATES,
     INFORMATION,
+    LATE,
     TWIST,
     Correspondences,
     as_confidence,
@@ -181,6 +182,7 @@ def _from_plain_columns(table: pa.Table) -> Correspondences:
         else np.ones(len(table), np.float32),
         information_px=stack(INFORMATION) if INFORMATION[0] in given else None,
         twist_per_s=stack(TWIST) if TWIST[0] in given else None,
+        late_s=table[LATE].to_numpy().astype(np.float64) if LATE in given else None,
         stamp_ns=_whole(table, "stamp_ns") if "stamp_ns" in given else None,
         metadata=json.loads((table.schema.metadata or {}).get(b"matcher", b"{}")),
     )

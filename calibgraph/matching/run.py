@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from calibgraph.arrays import Array
 from calibgraph.errors import MotionError
@@ -106,6 +107,29 @@ def with_motion(table: Correspondences, data: Dataset) -> Correspondences:
         return table
     of_rows = np.array([known[number] for number in table.frame.tolist()]).reshape(-1, 6)
     return replace(table, twist_per_s=of_rows)
+
+
+def with_delays(table: Correspondences, data: Dataset) -> Correspondences:
+    """The table with how long after its pixel each point was taken, where clouds are as swept.
+
+    It is zero in frames during which the vehicle stands. Images of unknown times count as taken in
+    the middle of the sweep.
+    """
+    if not len(table) or data.frames[0].load_sweep() is None:
+        return table
+    late_s, stands = np.zeros(len(table)), {n for stop in table.places.stationary for n in stop}
+    for frame in data.frames:
+        rows = np.flatnonzero(table.frame == frame.index)
+        sweep = None if frame.index in stands or not len(rows) else frame.load_sweep()
+        if sweep is None:
+            continue
+        points, times_s = sweep
+        taken_s = [frame.image_after_s(name) for name in table.cameras]
+        middle_s = (times_s.min() + times_s.max()) / 2
+        each_s = np.array([middle_s if of is None else of for of in taken_s])
+        _, nearest = cKDTree(points).query(table.points_lidar_m[rows])
+        late_s[rows] = times_s[nearest] - each_s[table.camera_index[rows]]
+    return replace(table, late_s=late_s)
 
 
 def summarize_round(table: Correspondences, before: Rig, after: Rig) -> RoundSummary:

@@ -267,7 +267,13 @@ class Calibration:
             moves = any(camera.time_offset_s or camera.readout_s for camera in cameras)
         else:
             moves = table.twist_per_s is not None
-        return left_out(self.config, self.rig, has_new_lens=bool(self.lens), motion_known=moves)
+        return left_out(
+            self.config,
+            self.rig,
+            has_new_lens=bool(self.lens),
+            motion_known=moves,
+            points_timed=table is not None and table.late_s is not None,
+        )
 
     def error_bar_holds(self, name: str) -> bool:
         """Whether the covariance of a camera or pair "A->B" describes its error.

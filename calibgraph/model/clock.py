@@ -75,17 +75,22 @@ def odd_motions(table: Correspondences) -> list[str]:
 
 
 def motion_of(camera: Camera, rows: Correspondences) -> Array | None:
-    """(n, 7) the LiDAR's twists, and when the pixels were taken [s]; None if it is unknown."""
-    if rows.twist_per_s is None:
-        return None
-    times_s = clock_of(camera).times_s(rows.pixels_px[:, 1])
-    return np.column_stack([rows.twist_per_s, times_s])
+    """(n, 7) the LiDAR's twists, and when the pixels were taken after the points [s].
+
+    None of points of one instant while the motion is unknown. Where the delays of points alone are
+    known, the twists are zero, and times of the rig are not used.
+    """
+    late_s = np.zeros(len(rows)) if rows.late_s is None else rows.late_s
+    if rows.twist_per_s is not None:
+        times_s = clock_of(camera).times_s(rows.pixels_px[:, 1])
+        return np.column_stack([rows.twist_per_s, times_s - late_s])
+    return None if rows.late_s is None else np.column_stack([np.zeros((len(rows), 6)), -late_s])
 
 
 def at_pixels(camera: Camera, rows: Correspondences) -> Correspondences:
     """One camera's rows, with their points where they were when their pixels were taken."""
     motion = motion_of(camera, rows)
-    if motion is None or not motion[:, 6].any():
+    if motion is None or not motion[:, 6].any() or not motion[:, :6].any():
         return rows
     points = displace(rows.points_lidar_m, motion[:, :6], -motion[:, 6])
     return replace(rows, points_lidar_m=points)

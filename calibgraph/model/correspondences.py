@@ -27,6 +27,7 @@ TABLE_FORMAT = "calibgraph-correspondences/1"
 COORDINATES = ("u_px", "v_px", "x_m", "y_m", "z_m")
 INFORMATION = ("i_uu_px", "i_uv_px", "i_vv_px")
 TWIST = ("wx_rad_s", "wy_rad_s", "wz_rad_s", "vx_m_s", "vy_m_s", "vz_m_s")
+LATE, MAX_LATE_S = "late_s", 10.0  # of no image and cloud that belong together
 MAX_TWIST = 6.0, 100.0  # rad/s and m/s: beyond those of a vehicle; swapped ones are seen
 TWIST_RULE = "be under 6 rad/s, then under 100 m/s (rotation first, in radians)"
 
@@ -34,7 +35,7 @@ MIN_INFORMATION, MAX_INFORMATION = 1e-12, 1e8  # 1/px^2: errors from 1e6 px down
 
 _WHOLE = ("frame", "stamp_ns")
 _REQUIRED = ("camera", "frame", *COORDINATES)
-_COLUMNS = (*_REQUIRED, "confidence", "stamp_ns", *INFORMATION, *TWIST)
+_COLUMNS = (*_REQUIRED, "confidence", "stamp_ns", *INFORMATION, *TWIST, LATE)
 _FORMER = "point_index"  # a column of earlier tables, which is not read
 _TEXT = ("string", "large_string", "string_view", "binary", "large_binary")
 
@@ -64,6 +65,8 @@ class Correspondences:
             normal). None stands for the identity.
         stamp_ns: (n,) or None: time of the frame.
         twist_per_s: (n, 6) or None: of the LiDAR in its axes, rotation [rad/s], translation [m/s].
+        late_s: (n,) or None: how long after its pixel a point was taken [s], where clouds are not
+            corrected for motion; zero while the vehicle stands. None of clouds of one instant.
         metadata: as the file has it: the matcher, its settings, its findings and the places.
         findings: the matcher's, read from the metadata.
         places: which frames share a place, read from the metadata.
@@ -82,6 +85,7 @@ class Correspondences:
     information_px: Array | None = None
     stamp_ns: NDArray[np.int64] | None = None
     twist_per_s: Array | None = None
+    late_s: Array | None = None
     metadata: dict[str, Any] = field(default_factory=dict)
     findings: MatcherFindings = field(init=False)
     places: Places = field(init=False)
@@ -182,6 +186,14 @@ class Correspondences:
         return self.select(~np.isin(self.camera_index, left_out)) if left_out else self
 
     @property
+    def is_swept(self) -> bool:
+        """Whether points and pixels are apart in time while the motion is unknown.
+
+        A lens or clock can then not be told from the motion.
+        """
+        return self.twist_per_s is None and self.late_s is not None and bool(self.late_s.any())
+
+    @property
     def matcher(self) -> str:
         """The name of the matcher; empty if the table does not state it."""
         name = self.metadata.get("matcher")
@@ -234,6 +246,7 @@ class Correspondences:
         columns |= {} if self.stamp_ns is None else {"stamp_ns": self.stamp_ns}
         for names, values in ((INFORMATION, self.information_px), (TWIST, self.twist_per_s)):
             columns |= {} if values is None else dict(zip(names, values.T, strict=True))
+        columns |= {} if self.late_s is None else {LATE: self.late_s}
         metadata = {"format": TABLE_FORMAT, "matcher": json.dumps(self.metadata)}
         return pa.table(columns).replace_schema_metadata(metadata)
 
@@ -244,6 +257,8 @@ class Correspondences:
         if (twist := self.twist_per_s) is not None:
             self._require(np.isfinite(twist).all(axis=1), "twist", twist, "be finite")
             self._require(~beyond_vehicles(twist), "twist", twist, TWIST_RULE)
+        if (late := self.late_s) is not None:
+            self._require(np.abs(late) < MAX_LATE_S, LATE, late, f"be below {MAX_LATE_S:g} s")
         c = self.confidence
         self._require((c > 0) & (c <= 1), "confidence", c, "lie in (0, 1]")
         if self.information_px is not None:
@@ -264,7 +279,7 @@ class Correspondences:
 
 _WIDTHS = {
     "camera_index": 1, "frame": 1, "pixels_px": 2, "points_lidar_m": 3, "confidence": 1,
-    "information_px": 3, "stamp_ns": 1, "twist_per_s": 6,
+    "information_px": 3, "stamp_ns": 1, "twist_per_s": 6, "late_s": 1,
 }  # fmt: skip
 _OTHERS = {"cameras", "metadata", "findings", "places"}
 assert set(_WIDTHS) == {f.name for f in fields(Correspondences)} - _OTHERS
@@ -292,6 +307,9 @@ def concatenate(tables: Sequence[Correspondences]) -> Correspondences:
         stated = [(table.information_px, len(table)) for table in tables]
         parts = [np.tile([1.0, 0.0, 1.0], (n, 1)) if i is None else i for i, n in stated]
         columns["information_px"] = np.concatenate(parts)
+    if any(table.late_s is not None for table in tables):
+        late = [np.zeros(len(t)) if t.late_s is None else t.late_s for t in tables]
+        columns[LATE] = np.concatenate(late)
     for name in ("stamp_ns", "twist_per_s"):
         given = [getattr(table, name) for table in tables if len(table)]
         if given and all(column is not None for column in given):

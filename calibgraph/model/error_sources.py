@@ -33,6 +33,9 @@ MOST_TIMES = TIMES[-1]
 _ADVICE = {
     LENSES: "State how well lenses and clocks are known (intrinsics_sigma_px, distortion_sigma, "
     "time_offset_sigma_s), or calibrate them with a target.",
+    MOTION: "Correct the clouds for the motion of the vehicle (--motion for bags, --interval-s for "
+    "folders), or record while it stands, two frames or more at each stop. If they are corrected "
+    "already, leave the times of points out.",
     ESTIMATED: "Estimate fewer parts of the lens (--estimate), state how well it is known "
     "(intrinsics_sigma_px, distortion_sigma), or calibrate it with a target.",
 }
@@ -124,13 +127,17 @@ class ErrorSources:
         return max(rotation, translation, key=lambda bar: bar[0] / bar[1])
 
 
-def left_out(config: Config, rig: Rig, *, has_new_lens: bool, motion_known: bool) -> str:
+def left_out(
+    config: Config, rig: Rig, *, has_new_lens: bool, motion_known: bool, points_timed: bool
+) -> str:
     """The errors that the bars leave out: relative poses show the clouds' scale.
 
-    By what was estimated, and whether the LiDAR's motion is known.
+    By what was estimated, whether the LiDAR's motion is known, and when points were taken. Without
+    either, clouds count as corrected for it.
     """
     free = has_new_lens and {*config.estimate} - {"offset", "readout"}
     lens = "other intrinsics" if free else "intrinsics"
     others = [] if motion_known or "offset" in config.estimate else ["time offset"]
+    others += [] if motion_known or points_timed else ["motion during a scan"]
     others += [] if rig.relative_poses else ["range scale"]
     return ", ".join([f"{lens} beyond what the rig states", *others])

@@ -15,7 +15,8 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from calibgraph.arrays import Array
-from calibgraph.model.pose_kernel import exponential_times, logarithms
+from factors.arrays import contiguous
+from factors.pose_kernel import exponential_times, logarithms
 
 
 def transform(rotation: Rotation | ArrayLike, translation: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
@@ -186,7 +187,7 @@ def retract_all(T_camera_lidar: Array, steps: Array) -> Array:
         steps: (f, 6) tangents of T_lidar_camera: rotation [rad], translation [m].
     """
     moved = np.empty((len(steps), 4, 4))
-    exponential_times(-steps, np.ascontiguousarray(T_camera_lidar), moved)
+    exponential_times(contiguous(-steps), contiguous(T_camera_lidar), moved)
     return moved
 
 

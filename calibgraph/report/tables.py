@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 import gtsam
 import numpy as np
@@ -115,17 +114,6 @@ def print_summary(console: Console, summary: Summary, details: str) -> None:
         lines.append(f"{more} more finding{'s' if more > 1 else ''}: see {details}")
     for line in lines:
         console.out(line, highlight=False)
-
-
-def print_weights(console: Console, summary: Mapping[str, Any], converted: Path | None) -> None:
-    """Print the content of a file of weights."""
-    network = ", ".join(f"{key} {value}" for key, value in summary["network"].items())
-    config = ", ".join(f"{key} {value}" for key, value in summary["config"].items())
-    console.out(f"{summary['file']}: CMRNext, {summary['parameters']} parameters", highlight=False)
-    for line in (f"sha256 {summary['sha256']}", f"network: {network}", f"config: {config}"):
-        console.out(f"  {line}", highlight=False)
-    if converted is not None:
-        console.out(f"{converted}: written", highlight=False)
 
 
 def result_table(result: Calibration) -> Table:

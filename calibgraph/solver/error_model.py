@@ -72,8 +72,9 @@ def relative_pose_conflict(
     sigmas = pair.rotation_sigma_rad, pair.translation_sigma_m
     own = pose_sigmas(rotation_rad=sigmas[0], translation_m=sigmas[1]) ** 2
     places = cameras.index(pair.a), cameras.index(pair.b)
-    of_pair = relative_covariance(covariance, *places, invert(estimated))
-    return Conflict(pair, difference, np.sqrt(own + np.diag(of_pair)))
+    of_pair = np.diag(relative_covariance(covariance, *places, invert(estimated)))
+    # Where priors were taken out of what the data leave open, rounding may leave less than none.
+    return Conflict(pair, difference, np.sqrt(own + np.maximum(of_pair, 0.0)))
 
 
 Numbers = NDArray[np.int64]

@@ -19,15 +19,20 @@ from scipy.optimize import isotonic_regression
 from calibgraph.arrays import Array
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
-from calibgraph.model.geometry import invert, local_coordinates
+from calibgraph.model.geometry import invert, local_coordinates, retract_all
 from calibgraph.parallel import map_on_cores
 from calibgraph.solver.matches import CameraBlock
-from calibgraph.solver.pnp import move_damped
-from calibgraph.solver.robust import CAUCHY_SCALE_SIGMAS, CUT, robust_spread, robust_spreads
+from calibgraph.solver.pnp import DAMPING
+from calibgraph.solver.robust import (
+    CAUCHY_SCALE_SIGMAS,
+    CUT,
+    MIN_SIGMA_PX,
+    robust_spread,
+    robust_spreads,
+)
 from calibgraph.solver.stage1 import Stage1
 from calibgraph.solver.two_pass import USING_CORRESPONDENCES
 from factors import to_runs
-from factors.arrays import unpack_sums
 
 MIN_FRAMES_TO_WEIGH = 8
 """Fewer frames do not determine their own scatter; weights from them would shrink the error bar."""
@@ -46,9 +51,8 @@ _CONVERGED = 1e-6  # rad, m: far below any standard deviation
 _CONFIDENCE_BINS, _BIN_MATCHES = 20, 100  # a spread of 100 matches is known to 7 %
 _CHANCE = 2.0  # times the mean square displacement by noise: exceeded by 5 % of frames
 _MIN_SIZE = 0.05  # of a frame's spread, which is at least MIN_SIGMA_PX
-_OWN_STEPS = 6  # Gauss-Newton steps to a frame's own extrinsic, at most
-_SETTLED = 0.05  # standard deviations: a shorter step of all frames is the last
-_MAX_STEP_RAD = 0.05  # rotation of one step, 3 degrees: beyond it the linearization does not hold
+_OWN_FITS, _OWN_TOLERANCE = 3, 1e-4  # of a frame's own extrinsic; relative, of the cost
+_SETTLED = 0.05  # relative change of the spreads of all frames
 _MAX_SPREAD = 1e6  # px, in place of the infinite spread of a frame that is all behind its camera
 _MIN_MATCHES = 10  # fewer residuals about a frame's own extrinsic (6 unknowns) give no spread
 
@@ -80,13 +84,15 @@ class FrameFits:
         return 6 * self.spreads**2 / self.counts
 
 
-def fit_each_frame(block: CameraBlock, own: Array, common: Array) -> FrameFits:
-    """Fit every frame alone by damped Gauss-Newton steps, its loss as wide as its residuals spread.
+def fit_each_frame(block: CameraBlock, own: Array, common: Array, *, most_px: float) -> FrameFits:
+    """Fit every frame alone, its loss as wide as its residuals spread.
 
     Args:
         block: of one camera.
         own: (f, 4, 4) T_camera_lidar of its frames, by PnP of each.
         common: (4, 4) T_camera_lidar that a frame starts from if its own fits worse.
+        most_px: spread of a frame's residuals, beyond which none of its matches are good, so that a
+            fit would lead anywhere: it stays where it starts.
     """
     runs, counts = to_runs(block.frame_edges), block.frame_counts
     least = block.least_spreads(runs)
@@ -96,18 +102,19 @@ def fit_each_frame(block: CameraBlock, own: Array, common: Array) -> FrameFits:
 
     tried = np.stack([own, np.broadcast_to(common, own.shape)])
     found = [robust_spreads(block.all_sizes(T, runs)[1], runs) for T in tried]
-    better = found[0] <= found[1]
-    T: Array = np.where(better[:, None, None], tried[0], tried[1])
-    spreads = bounded(np.where(better, found[0], found[1]))
-    for _ in range(_OWN_STEPS):
-        sums = block.block.packed_run_sums(T, runs, CAUCHY_SCALE_SIGMAS * spreads)
-        T, steps = move_damped(sums, T, most_rad=_MAX_STEP_RAD)
-        hessians = unpack_sums(sums).hessian
-        lengths = np.sqrt(np.einsum("fi,fij,fj->f", steps, hessians, steps)) / spreads
+    better = (found[0] <= found[1])[:, None, None]
+    T: Array = np.where(better, tried[0], tried[1])
+    spreads = bounded(np.minimum(found[0], found[1]))
+    is_fitted = spreads * MIN_SIGMA_PX < most_px * least
+    for _ in range(_OWN_FITS):
+        scales, before = CAUCHY_SCALE_SIGMAS * spreads, spreads
+        moved, sums, _ = block.block.fit(T, runs, scales, tolerance=_OWN_TOLERANCE)
+        T = np.where(is_fitted[:, None, None], moved, T)
         sizes_px, sizes = block.all_sizes(T, runs)
         spreads = bounded(robust_spreads(sizes, runs))
-        if lengths.max() < _SETTLED:
+        if np.abs(spreads / before - 1.0).max() < _SETTLED:
             break
+    hessians = sums.hessian
     spreads_px = spreads if sizes_px is sizes else robust_spreads(sizes_px, runs)
     each = np.repeat(spreads, counts)
     inside = np.add.reduceat(sizes <= CUT * each, runs[:, 0])
@@ -136,8 +143,8 @@ def weigh_all_frames(
     *,
     config: Config,
     terms: Terms,
-) -> dict[str, tuple[CameraBlock, Array, int]]:
-    """Per camera, as of :func:`weigh_frames`; its correspondences, weighted by their residuals.
+) -> tuple[dict[str, CameraBlock], dict[str, Array], dict[str, int]]:
+    """Per camera, the three of :func:`weigh_frames`.
 
     Unchanged if ``learnt_weights`` is off, Stage 1 is not PnP, or ``terms`` has no reprojection
     term.
@@ -150,8 +157,9 @@ def weigh_all_frames(
         config: ``learnt_weights``, ``stage1``.
         terms: of the objective.
     """
-    if not (config.learnt_weights and config.stage1 == "pnp" and terms in USING_CORRESPONDENCES):
-        return {name: (block, start[name], 0) for name, block in blocks.items()}
+    is_wanted = config.learnt_weights and config.stage1 == "pnp" and terms in USING_CORRESPONDENCES
+    if not (blocks and is_wanted):
+        return dict(blocks), {}, {}
 
     def weigh(name: str) -> tuple[CameraBlock, Array, int]:
         return weigh_frames(
@@ -159,9 +167,12 @@ def weigh_all_frames(
             table.of_camera(name).confidence.astype(np.float64),
             start[name],
             stage1[name].by_frame if name in stage1 else {},
+            most_px=config.pnp_threshold_px,
         )
 
-    return dict(zip(blocks, map_on_cores(weigh, [*blocks]), strict=True))
+    weighed = zip(*map_on_cores(weigh, [*blocks]), strict=True)
+    kept, densest, outliers = (dict(zip(blocks, each, strict=True)) for each in weighed)
+    return kept, densest, outliers
 
 
 def weigh_frames(
@@ -169,6 +180,8 @@ def weigh_frames(
     confidence: Array,
     T_camera_lidar: Array,
     by_frame: Mapping[int, Array],
+    *,
+    most_px: float,
 ) -> tuple[CameraBlock, Array, int]:
     """Weigh the correspondences of one camera by the residuals of its frames and confidences.
 
@@ -177,6 +190,7 @@ def weigh_frames(
         confidence: (n,) of its correspondences.
         T_camera_lidar: (4, 4) where to start; it may be that of a wrong majority of frames.
         by_frame: (4, 4) T_camera_lidar of single frames, by PnP.
+        most_px: as of :func:`fit_each_frame`.
 
     Returns:
         The correspondences without those of outlier frames; (4, 4) T_camera_lidar where the frames
@@ -187,7 +201,7 @@ def weigh_frames(
         return block, T_camera_lidar, 0
     numbers = block.frame[edges[:-1]]
     own = np.array([by_frame.get(number, T_camera_lidar) for number in numbers.tolist()])
-    frames = fit_each_frame(block, own, T_camera_lidar)
+    frames = fit_each_frame(block, own, T_camera_lidar, most_px=most_px)
     sigmas = confidence_sigmas(frames.sizes, confidence)
     start = densest_start(block, frames, T_camera_lidar)
     T_consensus, weights = find_consensus(frames, start)
@@ -206,8 +220,7 @@ def find_consensus(frames: FrameFits, start: Array) -> tuple[Array, Array]:
     """
     center, noise = start, frames.noise
     typical = float(np.median(noise))
-    T_lidar_camera, sums = invert(frames.T_camera_lidar), np.zeros((len(noise), 28))
-    sums[:, :21] = frames.hessians[:, *np.triu_indices(6)]
+    T_lidar_camera, hessians = invert(frames.T_camera_lidar), frames.hessians.reshape(-1, 36)
     by_chance, own = _CHANCE * np.maximum(noise - typical, 0), frames.spreads**2
     for number in range(_STEPS):
         away = local_coordinates(center, T_lidar_camera)
@@ -221,8 +234,10 @@ def find_consensus(frames: FrameFits, start: Array) -> tuple[Array, Array]:
             return start, np.ones(len(near))
         scatter = max(float(near @ (shift - noise) / near.sum()), 0.0)
         weights = near / (own + frames.counts * scatter / 6)
-        sums[:, 21:27] = -products
-        (center,), step = move_damped((weights @ sums)[None], center[None])
+        hessian = (weights @ hessians).reshape(6, 6)
+        hessian.flat[::7] *= 1 + DAMPING
+        step = np.linalg.solve(hessian, weights @ products)
+        center = retract_all(center[None], step[None])[0]
         if number > _SEARCH_STEPS and np.abs(step).max() < _CONVERGED:
             break
     return center, weights / weights.max()

@@ -9,6 +9,7 @@ matches, S that by the scatter of frames, and k the variance that matches are le
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
+from dataclasses import replace
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -26,7 +27,7 @@ from calibgraph.model.rig import Camera, Rig
 from calibgraph.solver.covariance import FittedObjective, positive_part
 from calibgraph.solver.places import ErrorFit
 from calibgraph.solver.within_place import WEAK, WithinPlace
-from factors import ProjectionBlock, to_runs
+from factors import Columns, ProjectionBlock, to_runs
 from factors.columns import CENTRE_X, CENTRE_Y, FOCAL, OFFSET, READOUT
 
 Lenses = Mapping[str, LensVariable]
@@ -44,6 +45,8 @@ _SCENES = 0.7, 1.4  # times as far are the things of another recording: so stree
 _DEPTHS = 0.5, 1.0, 2.0  # of a scene, over its mean
 _SAMPLE, _DIRECTIONS_SEEN = 3000, 500  # at most, of the matches, and of their directions
 _NEAREST_M = 0.1  # added to distances, whose logarithms are taken
+_TRAVEL = np.diag([0.0, 0.0, 0.1, 10.0, 10.0, 0.0])[2:5]
+"""Of a vehicle on a street, standard deviations of turns [rad/s] and speeds [m/s], z upwards."""
 _DIRECTIONS = "pitch", "yaw", "roll", "x", "y", "z"
 _UNITS = {FOCAL: "px", CENTRE_X: "px", CENTRE_Y: "px", OFFSET: "s", READOUT: "s"}
 
@@ -126,13 +129,31 @@ def lens_errors(at: FittedObjective) -> dict[int, Array]:
     return found
 
 
+def travel_errors(at: FittedObjective) -> Array:
+    """(6 N, 3) of all poses, by a standard deviation of each unknown motion of the vehicle.
+
+    In the tangents of T_lidar_camera. Where clouds were swept while it drove, and are not
+    corrected, every pose makes up for the way between points and pixels: all by the same motion.
+    """
+    found = np.zeros((len(at.cameras), 6, len(_TRAVEL)))
+    for name, block in at.projections.items():
+        if block.motion is None or block.motion[:, :6].any():
+            continue  # of one instant, or moved to the time of the pixels
+        shift, T = Columns(block.lens, (OFFSET,), (1.0,)), at.T_camera_lidar[name][None]
+        for column, twist in zip(found[at.cameras.index(name)].T, _TRAVEL, strict=True):
+            of_unit = np.column_stack([np.outer(block.motion[:, 6], twist), np.zeros(len(block))])
+            hessian = replace(block, motion=of_unit).summarize(T, None, shift).hessian[0]
+            column[:] = np.linalg.solve(hessian[:6, :6] + WEAK, hessian[:6, 6])
+    return found.reshape(-1, len(_TRAVEL))
+
+
 def considered_lens(camera: Camera, block: ProjectionBlock) -> LensVariable:
     """What may err of a lens, as the rig states or as of a calibrated camera.
 
     And of the clock, where the motion of the LiDAR is known.
     """
     parts: list[LensPart] = [*_LENS]
-    if block.motion is not None:
+    if block.motion is not None and block.motion[:, :6].any():
         parts += ["offset", "readout"] if camera.readout_sigma_s else ["offset"]
     return LensVariable.of(camera, parts, LensSigmas.calibrated(camera))
 

@@ -33,7 +33,7 @@ from calibgraph.solver.two_pass import RELATIVE_TOLERANCE, Objective, Optimum
 from factors import pose_sigmas
 
 _NARROWINGS = 3  # steps at most from the spread at the estimate to the least one, by half each
-_COARSE = 1e-6  # relative change of the error at which each of them stops
+_COARSE = 1e-5  # relative change of the error at which each of them stops
 _MAX_STEPS, _MAX_STEP, _CONVERGED = 30, 0.1, 1e-5  # of a pair alone: rad, m
 _SETTLED, _MOST = 0.005, 9  # relative change of a spread that ends its measuring, and its steps
 Places = Mapping[frozenset[str], Mapping[str, Array]]

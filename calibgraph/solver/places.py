@@ -46,10 +46,10 @@ from calibgraph.model.geometry import (
     retract_all,
     to_T_lidar_camera,
 )
-from calibgraph.model.pose_kernel import logarithms
 from calibgraph.solver.two_pass import MAX_ITERATIONS
 from factors import BlockSums
 from factors.conditioning import unit_diagonal
+from factors.pose_kernel import logarithms
 
 TOLERANCE = 1e-6
 """Relative change of the cost at which it stops: some 1e-3 of the smallest standard deviations."""

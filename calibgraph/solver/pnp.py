@@ -1,6 +1,6 @@
 """Robust poses of frames of one camera: many at once over stacked sums, and of one by MAGSAC."""
 
-import math
+from collections.abc import Sequence
 from itertools import product
 
 import cv2
@@ -12,85 +12,38 @@ from calibgraph.arrays import Array
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import transform
-from calibgraph.model.pose_kernel import MAX_DAMPING, descend
 from calibgraph.model.rig import Camera
 from calibgraph.solver.matches import MIN_MATCHES
 from factors import ProjectionBlock, unproject
-from factors.arrays import unpack_sums
 from factors.conditioning import smallest_scaled_eigenvalues
 
 Runs = NDArray[np.int64]
 """(f, 2): the first correspondence of each frame, and the one behind its last."""
 
-_MAX_STEPS = 50  # with a start in the right basin, 4 to 8 are enough
-_DAMPING = 1e-5  # relative to the diagonal, at first
-FINE, COARSE = 1e-10, 1e-3
-"""Relative decrease of the cost at which a fit stops: at the optimum; as a start for another."""
 DAMPING = 1e-6
 """Of the diagonal, for frames that leave a direction free."""
-
+FINE, COARSE = 1e-6, 1e-3
+"""Relative decrease of the cost at which a fit stops: at the optimum; as a start for another."""
 _MIN_INLIER_SHARE = 0.1  # chosen, not measured
 _MIN_SCALED_EIGENVALUE = 1e-9  # below it a direction is free: points on one line, or in one place
 
 
-def fit_frames(
-    block: ProjectionBlock, runs: Runs, T_camera_lidar: Array, *, tolerance: float = FINE
-) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Minimize the robust cost of each frame by itself.
-
-    Args:
-        block: correspondences of one camera.
-        runs: (f, 2) those of each frame.
-        T_camera_lidar: (f, 4, 4) starts.
-        tolerance: relative decrease of the cost at which a frame is done.
-
-    Returns:
-        (f, 4, 4) minima; (f, 6, 6) Hessians there; (f,) which stopped by the tolerance.
-    """
-    T, sums = T_camera_lidar.copy(), block.packed_run_sums(T_camera_lidar, runs)
-    dampings, active = np.full(len(T), _DAMPING), np.arange(len(T))
-    steps, tried, new = np.empty((len(T), 6)), np.empty_like(T), sums[:0]
-    for _ in range(1 + _MAX_STEPS):
-        count = descend(sums, T, dampings, active, steps, tried, new, (tolerance, math.inf))
-        if not count:
-            break
-        new = block.packed_run_sums(tried[:count], runs[active[:count]])
-    converged = dampings < MAX_DAMPING
-    converged[active[:count]] = False
-    return T, unpack_sums(sums).hessian, converged
-
-
-def move_damped(
-    sums: Array, T_camera_lidar: Array, *, damping: float = DAMPING, most_rad: float = math.inf
-) -> tuple[Array, Array]:
-    """Poses at the minima of quadratic costs; a direction that is free gets no step.
-
-    Args:
-        sums: (f, 28) of each pose, as ``ProjectionBlock.packed_run_sums``.
-        T_camera_lidar: (f, 4, 4).
-        damping: what is added to the diagonal, relative to it.
-        most_rad: that a step turns about an axis; longer ones are shortened.
-
-    Returns:
-        (f, 4, 4) T_camera_lidar; (f, 6) the steps, in the tangent of T_lidar_camera.
-    """
-    count = len(sums)
-    steps, moved = np.empty((count, 6)), np.empty((count, 4, 4))
-    T, dampings = np.array(T_camera_lidar), np.full(count, damping)  # which can be written
-    descend(sums, T, dampings, np.arange(count), steps, moved, sums[:0], (0.0, most_rad))
-    return moved, steps
-
-
 def refine_frames(
-    block: ProjectionBlock, runs: Runs, T_camera_lidar: Array, config: Config
+    block: ProjectionBlock,
+    runs: Runs,
+    T_camera_lidar: Array,
+    config: Config,
+    *,
+    tolerances: Sequence[float] = (COARSE, FINE),
 ) -> tuple[Array, NDArray[np.bool_], NDArray[np.int64]]:
-    """Re-select each frame's inliers with the full lens model and refine on them, a few times.
+    """Re-select each frame's inliers with the full lens model and refine on them.
 
     Args:
         block: of all frames, with all their matches, unweighted.
         runs: (f, 2) those of each frame, one behind the other.
         T_camera_lidar: (f, 4, 4) starts.
         config: ``pnp_threshold_px``.
+        tolerances: of each fit; by default one with the inliers of PnP, and one with those of it.
 
     Returns:
         (f, 4, 4) poses; (f,) whether enough matches agree on each, and leave no direction of it
@@ -98,8 +51,8 @@ def refine_frames(
     """
     least = np.maximum(MIN_MATCHES, _MIN_INLIER_SHARE * (runs[:, 1] - runs[:, 0]))
     found = np.ones(len(runs), dtype=np.bool_)
-    for tolerance in (COARSE, FINE):  # with the inliers of PnP, then with those of the first
-        residuals, projectable = block.run_residuals(T_camera_lidar, runs)
+    for tolerance in tolerances:
+        residuals, projectable = block.residuals(T_camera_lidar, runs)
         squared = residuals[:, 0] ** 2 + residuals[:, 1] ** 2
         inlier = projectable & (squared < config.pnp_threshold_px**2)
         places = np.concatenate([[0], np.cumsum(inlier)])[runs]
@@ -107,8 +60,8 @@ def refine_frames(
         found &= inliers >= least
         some = block.select(inlier).rescale(scale=config.pnp_threshold_px / 2)
         places[~found] = 0
-        T_camera_lidar, own, _ = fit_frames(some, places, T_camera_lidar, tolerance=tolerance)
-        found &= smallest_scaled_eigenvalues(own) >= _MIN_SCALED_EIGENVALUE
+        T_camera_lidar, own, _ = some.fit(T_camera_lidar, places, tolerance=tolerance)
+        found &= smallest_scaled_eigenvalues(own.hessian) >= _MIN_SCALED_EIGENVALUE
     return T_camera_lidar, found, inliers
 
 
@@ -226,7 +179,7 @@ def pose_near_guess(
     block = ProjectionBlock(camera.lens, matches.points_lidar_m, matches.pixels_px)
     wide = block.rescale(scale=_WIDE * config.pnp_threshold_px)
     start, runs = camera.T_camera_lidar[None], np.array([[0, len(block)]])
-    T_camera_lidar, *_ = fit_frames(wide, runs, start, tolerance=COARSE)
+    T_camera_lidar, *_ = wide.fit(start, runs, tolerance=COARSE)
     return np.asarray(T_camera_lidar[0])
 
 

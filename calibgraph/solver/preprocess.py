@@ -152,8 +152,7 @@ def are_projectable(
         rows = rows_where(camera == number)
         points = table.points_lidar_m
         own = points[rows] if isinstance(rows, slice) else points.take(rows, axis=0)
-        T = model.T_camera_lidar
-        keep[rows] = model.lens.project(own @ T[:3, :3].T + T[:3, 3])[1]
+        keep[rows] = model.lens.project(own, model.T_camera_lidar)[1]
     return keep
 
 

@@ -29,7 +29,7 @@ from calibgraph.solver.error_model import (
     fit_without_priors,
     relative_pose_conflict,
 )
-from calibgraph.solver.lens import lens_estimates, moved_lenses, put_into
+from calibgraph.solver.lens import lens_estimates, moved_lenses, put_into, travel_errors
 from calibgraph.solver.pair_refinement import (
     PairFit,
     Places,
@@ -143,6 +143,15 @@ class Solution:
         """
         return None if self.error_fit is None else self.error_fit.covariance
 
+    @cached_property
+    def travel(self) -> Array:
+        """(6 N, 3) what a drive does to poses whose clouds are not corrected for its motion.
+
+        By one standard deviation of each motion. It is no part of ``covariance``: the images of
+        this drive show these poses.
+        """
+        return travel_errors(self.fitted)
+
     @property
     def mount(self) -> ErrorFit | None:
         """The fit of the mounts, between which images and measurements show relative poses."""
@@ -160,7 +169,9 @@ class Solution:
         Args:
             joint: (6 N, 6 N) the reported covariance, which may be wider than that of the matches.
         """
-        return {} if self.error_fit is None else error_sources(self.error_fit, joint, self.held)
+        if self.error_fit is None:
+            return {}
+        return error_sources(self.error_fit, joint, self.travel, self.held)
 
     @cached_property
     def pair_terms(self) -> tuple[PairTerm, ...]:

@@ -11,24 +11,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
-from calibgraph.model.clock import at_pixels
 from calibgraph.model.config import Config
-from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import retract_all, twists_between
-from calibgraph.model.pose_kernel import logarithms
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.parallel import map_on_cores
+from calibgraph.solver.matches import CameraBlock
 from calibgraph.solver.pnp import (
     COARSE,
+    FINE,
     Runs,
-    fit_frames,
     frame_pose,
     pose_near_guess,
     ransac_pnp,
     refine_frames,
 )
-from calibgraph.solver.preprocess import frame_edges
 from factors import ProjectionBlock, to_runs
+from factors.pose_kernel import logarithms
 
 _OUTLIER = 6.0  # median distances, 9 sigma of a Gaussian in three dimensions
 COMMON_SAMPLE = 1000
@@ -60,21 +58,21 @@ Stage1 = Mapping[str, CameraStage1]
 """The pairwise estimates, by camera."""
 
 
-def estimate_stage1(rig: Rig, table: Correspondences, config: Config) -> Stage1:
+def estimate_stage1(rig: Rig, blocks: Mapping[str, CameraBlock], config: Config) -> Stage1:
     """The pairwise estimates T_hat: by PnP, or the extrinsics of the rig as they are.
 
     Args:
         rig: lenses; its extrinsics are used with ``config.stage1 == "rig"`` alone.
-        table: preprocessed correspondences, those of a camera sorted by frame.
+        blocks: per camera, its correspondences; their weights are not used.
         config: ``stage1``, ``pnp_threshold_px``, ``seed``.
     """
+    cameras = [rig.cameras[name] for name in blocks]
     if config.stage1 == "rig":
-        named = [name for name in rig.cameras if name in table.cameras]
-        return {name: CameraStage1(rig.cameras[name].T_camera_lidar) for name in named}
-    cameras = [*rig.cameras.values()]
-    rows = [at_pixels(camera, table.of_camera(name)) for name, camera in rig.cameras.items()]
-    runs = [to_runs(frame_edges(of.camera_index, of.frame)) for of in rows]
-    common = map_on_cores(partial(_from_common_pose, config=config), cameras, rows, runs)
+        each = [CameraStage1(camera.T_camera_lidar) for camera in cameras]
+        return dict(zip(blocks, each, strict=True))
+    plain = [block.block.rewhiten(None) for block in blocks.values()]
+    runs = [to_runs(block.frame_edges) for block in blocks.values()]
+    common = map_on_cores(partial(_from_common_pose, config=config), cameras, plain, runs)
     left = [
         (number, frame)
         for number, (_, found) in enumerate(common)
@@ -83,15 +81,15 @@ def estimate_stage1(rig: Rig, table: Correspondences, config: Config) -> Stage1:
     searched = map_on_cores(
         partial(frame_pose, config=config),
         [cameras[number] for number, _ in left],
-        [rows[number].select(slice(*runs[number][frame])) for number, frame in left],
+        [plain[number].select(np.arange(*runs[number][frame])) for number, frame in left],
     )
     for (number, frame), T in zip(left, searched, strict=True):
         if T is not None:
             poses, found = common[number]
             poses[frame], found[frame] = T, True
     return {
-        name: aggregate_frames(poses[found], of.frame[own[found, 0]], len(own))
-        for name, (poses, found), of, own in zip(rig.cameras, common, rows, runs, strict=True)
+        name: aggregate_frames(poses[found], block.frame_numbers[found], block.frames)
+        for (name, block), (poses, found) in zip(blocks.items(), common, strict=True)
     }
 
 
@@ -105,7 +103,7 @@ def T_hat(pairwise_estimates: Stage1) -> dict[str, Array]:
 
 
 def _from_common_pose(
-    camera: Camera, rows: Correspondences, runs: Runs, config: Config
+    camera: Camera, block: ProjectionBlock, runs: Runs, config: Config
 ) -> tuple[Array, NDArray[np.bool_]]:
     """(f, 4, 4) poses of all frames from one for all of them together, and (f,) which are found.
 
@@ -113,15 +111,14 @@ def _from_common_pose(
     explain more. Three of them do not count, which any pose explains. So if all are found from a
     fit that starts at the guess, nothing is left for MAGSAC to find.
     """
-    sample = rows.select(slice(None, None, -(-len(rows) // COMMON_SAMPLE) or None))
-    block = ProjectionBlock(camera.lens, rows.points_lidar_m, rows.pixels_px)
+    sample = block.select(np.arange(0, len(block), -(-len(block) // COMMON_SAMPLE)))
     poses, found = np.tile(np.eye(4), (len(runs), 1, 1)), np.zeros(len(runs), dtype=np.bool_)
     wide = block.rescale(scale=config.pnp_threshold_px / 2)
     for start_of in (pose_near_guess, ransac_pnp):
         if found.all() or (start := start_of(camera, sample, config)) is None:
             break
-        near, *_ = fit_frames(wide, runs, np.tile(start, (len(runs), 1, 1)), tolerance=COARSE)
-        poses, found, inliers = refine_frames(block, runs, near, config)
+        near, *_ = wide.fit(start[None], runs, tolerance=COARSE)
+        poses, found, inliers = refine_frames(block, runs, near, config, tolerances=[FINE])
         found &= inliers - 3 > (runs[:, 1] - runs[:, 0]) / 2
     return poses, found
 

@@ -12,7 +12,6 @@ import numpy as np
 from calibgraph.arrays import Array
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.geometry import invert_each, pair_covariances, pose_rows
-from calibgraph.model.pose_kernel import logarithms
 from calibgraph.model.summary import summarize
 from calibgraph.model.verdict import START, Check, Verdict
 from calibgraph.report.as_json import finite
@@ -23,6 +22,7 @@ from calibgraph.tracking.state import COUNTS, State
 from calibgraph.trust.evidence import Estimate as Checked
 from calibgraph.trust.solution_checks import check_estimate
 from calibgraph.trust.thresholds import threshold
+from factors.pose_kernel import logarithms
 
 
 class Verdicts(Mapping[str, Verdict]):

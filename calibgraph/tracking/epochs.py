@@ -10,7 +10,6 @@ from calibgraph.model.geometry import (
     retract_all,
     to_T_lidar_camera,
 )
-from calibgraph.model.pose_kernel import logarithms
 from calibgraph.solver.robust import median_norm, robust_spread, scale_from
 from calibgraph.solver.within_place import WEAK
 from calibgraph.tracking.absorption import add_to_totals, count_epoch
@@ -21,6 +20,7 @@ from calibgraph.tracking.moves import report_drift, select_walk, shift_between, 
 from calibgraph.tracking.state import STRENGTHS, State
 from calibgraph.tracking.sums import Numbers, Sums
 from factors import to_runs
+from factors.pose_kernel import logarithms
 
 _GATE_STEPS = 4  # by the Hessian by weights, which descend: each leaves a fifth of the way
 _SMALL_STEP = 1e-2  # squared sigmas of independent matches

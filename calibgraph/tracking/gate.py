@@ -11,7 +11,6 @@ from calibgraph.arrays import Array, Mask
 from calibgraph.graph.objective import projection_graph
 from calibgraph.model.config import Config
 from calibgraph.model.geometry import invert_each
-from calibgraph.model.pose_kernel import logarithms
 from calibgraph.solver.matches import MIN_MATCHES, CameraBlock
 from calibgraph.solver.pnp import frame_pose
 from calibgraph.solver.robust import ResidualScale
@@ -19,8 +18,8 @@ from calibgraph.solver.two_pass import optimize
 from calibgraph.solver.within_place import WEAK
 from calibgraph.tracking.state import OutlierFrame, State
 from calibgraph.tracking.sums import Sums
-from factors import to_runs
-from factors.arrays import unpack_sums
+from factors import BlockSums, to_runs
+from factors.pose_kernel import logarithms
 
 _AGREEMENT = 0.7
 """A frame agrees with an estimate that explains this share of the usual share of its matches."""
@@ -99,14 +98,14 @@ def sums_of(state: State, gated: Mapping[int, Gated]) -> Sums:
         state: with the scales of the residuals, and how curved their cost is.
         gated: by camera; linearized at its poses.
     """
-    packed, at, cameras = [], [], list[int]()
+    parts, at, cameras = [], [], list[int]()
     for camera, one in gated.items():
         edges = np.concatenate([[0], one.counts.cumsum().astype(np.int64)])
         block = one.raw.with_scale(state.scales[camera]).select(one.inliers)
-        packed.append(block.packed_run_sums(one.poses, to_runs(edges)))
+        parts.append(block.summarize(one.poses, to_runs(edges)))
         at.append(np.broadcast_to(one.poses, (len(one.counts), 4, 4)))
         cameras += [camera] * len(one.counts)
-    here, poses, to = unpack_sums(np.concatenate(packed)), np.concatenate(at), state.references
+    here, poses, to = BlockSums.join(parts), np.concatenate(at), state.references
     root = np.linalg.cholesky(here.hessian + WEAK)
     hessian = root @ state.curvature[cameras] @ root.swapaxes(1, 2)
     gradient = here.gradient

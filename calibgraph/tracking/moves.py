@@ -24,7 +24,6 @@ import numpy as np
 
 from calibgraph.arrays import Array
 from calibgraph.model.geometry import adjoints, invert, pose_rows, retract_all
-from calibgraph.model.pose_kernel import logarithms
 from calibgraph.solver.components import pose_covariance
 from calibgraph.solver.matches import MIN_MATCHES, CameraBlock, merge
 from calibgraph.solver.within_place import WEAK
@@ -45,6 +44,7 @@ from calibgraph.tracking.gate import Gated, agrees, refine, sums_of
 from calibgraph.tracking.state import STRENGTHS, DriftWatch, OutlierFrame, State, rows_of
 from calibgraph.tracking.sums import Sums
 from factors import to_runs
+from factors.pose_kernel import logarithms
 
 Scatters = Mapping[int, Array]
 
@@ -437,7 +437,7 @@ def _date_step(state: State, detected: DetectedStep) -> tuple[DetectedStep, Meas
         raw = merge(_blocks_since(state, replace(detected, since=numbers[0]), camera))
         ends, runs = np.stack([now[camera] - step, now[camera]]), to_runs(raw.frame_edges)
         before, after = (
-            raw.with_scale(state.scales[camera]).run_sums(np.tile(T, (len(runs), 1, 1)), runs).cost
+            raw.with_scale(state.scales[camera]).summarize(np.tile(T, (len(runs), 1, 1)), runs).cost
             for T in retract_all(np.tile(state.references[camera], (2, 1, 1)), ends)
         )
         rows = np.searchsorted(numbers, raw.frame_numbers)

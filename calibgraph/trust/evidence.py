@@ -103,9 +103,12 @@ class Evidence:
 
     @cached_property
     def joint_covariance(self) -> Array | None:
-        """(6 N, 6 N) by matches and images, the wider one; cameras that are held are unknown."""
-        known = self.solution.covariance
-        return None if known is None else self._widen(known)
+        """(6 N, 6 N) by matches and images, the wider one, and by an unknown motion of the vehicle.
+
+        Cameras that are held are unknown.
+        """
+        known, travel = self.solution.covariance, self.solution.travel
+        return None if known is None else self._widen(known) + travel @ travel.T
 
     def _widen(self, joint: Array) -> Array:
         """(6 N, 6 N): a covariance, widened where the images' evidence is flat."""
@@ -122,8 +125,8 @@ class Evidence:
         """The probability that its error is beyond the tolerance, by its posterior."""
         own, found = self.covariance_by_matches(camera), self.posteriors.get(camera)
         tolerance = self.solution.config.tolerance
-        if own is None or found is None:
-            return probability_beyond(own, tolerance)
+        if own is None or found is None or self.solution.travel.any():
+            return probability_beyond(self.covariance_of(camera), tolerance)
         return found.probability_beyond(own, tolerance)
 
     def covariance_of(self, camera: str) -> Array | None:
@@ -132,7 +135,8 @@ class Evidence:
 
     def covariance_by_matches(self, camera: str) -> Array | None:
         """(6, 6) of one camera, not widened by what the images leave open."""
-        return self._rows_of(self.solution.covariance, camera)
+        known, travel = self.solution.covariance, self.solution.travel
+        return self._rows_of(None if known is None else known + travel @ travel.T, camera)
 
     def _rows_of(self, joint: Array | None, camera: str) -> Array | None:
         if joint is None or camera in self.solution.held:
@@ -147,6 +151,7 @@ class Evidence:
             return {}
         away = np.concatenate([twist_between(mount.T_camera_lidar[name], T[name]) for name in T])
         joint = self._widen(mount.covariance + np.outer(away, away))
+        joint += self.solution.travel @ self.solution.travel.T
         return pair_covariances(joint, T, self.solution.held)
 
 

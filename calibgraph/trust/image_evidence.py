@@ -298,6 +298,8 @@ def check_images(
     evidence = measure_image_evidence(
         dataset, Rig(cameras=cameras), places=table.places, seed=seed, progress=progress
     )
+    if table.is_swept:
+        evidence = {name: replace(found, lens=()) for name, found in evidence.items()}
     names = {frame.index: frame.name for frame in dataset.frames}
     return {
         name: (*evidence_checks(found, names, tolerance), *pairing_checks(found))

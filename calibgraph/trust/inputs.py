@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from calibgraph.arrays import Array
 from calibgraph.errors import DatasetError
-from calibgraph.io.bags import scan_duration_s
+from calibgraph.io.bags import MESSAGE_SUFFIX, scan_duration_s
 from calibgraph.io.dataset import Dataset, spread_out
 from calibgraph.io.frame import (
     Frame,
@@ -99,7 +99,8 @@ def find_doubts(rig: Rig, frame: Frame, cloud: Cloud) -> Iterator[str]:
             f"and {moved:.2g} m apart: clouds joined with a wrong extrinsic, or before their "
             "motion was corrected?"
         )
-    if frame.find_motion and scan_duration_s(frame.cloud_path) == 0:
+    is_message = frame.cloud_path.suffix == MESSAGE_SUFFIX
+    if is_message and frame.find_motion and scan_duration_s(frame.cloud_path) == 0:
         yield (
             f"all points of the cloud of frame {frame.name} have the same time, so that --motion "
             "moves it as a whole: record the times of points, or leave --motion out if the driver "

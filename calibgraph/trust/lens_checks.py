@@ -69,7 +69,7 @@ def image_offset_checks(run: MatchingRun) -> Checks:
     By a matcher made for them, since that of the run has been released.
     """
     config = run.solution.config
-    if not asks_offset(run):
+    if not asks_offset(run) or run.correspondences.is_swept:
         return {}
     rig, moved, registered = run.solution.without_pairs().solved_rig, None, False
     with suppress(CalibrationError, OSError):  # the checks on images report it
@@ -174,7 +174,8 @@ def intrinsics_checks(evidence: Evidence) -> Checks:
     By all matches, not only those within the gate. The variance of what the frames of a place share
     is taken for at least that of a small share of each match.
     """
-    names = [*evidence.fitted_blocks]
+    is_swept = evidence.solution.correspondences.is_swept  # which looks like a lens
+    names = [] if is_swept else [*evidence.fitted_blocks]
     checks = map_on_cores(lambda name: _check_camera(evidence, name), names)
     return dict(zip(names, checks, strict=True))
 

@@ -1,8 +1,7 @@
-"""The command `weights`, and `calibrate` with the matcher cmrnext."""
+"""`calibrate` with the matcher cmrnext."""
 
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
 
@@ -22,19 +21,9 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return saved(tmp_path_factory.mktemp("weights") / "random.tar", good_content())
 
 
-def test_weights_are_checked_and_converted(weights: Path, tmp_path: Path, call: Call) -> None:
-    converted = tmp_path / "good.safetensors"
-    assert call("weights", weights, "--out", converted)[0] == 0
-    code, _, line = call("weights", converted, "--out", converted)
-    assert code == 2 and "is there already" in line
-    described = json.loads(call("weights", converted, "--json")[1])
-    assert described["network"]["fourier_levels"] == 12
-    assert described["config"]["max_r"] == 1.0
-
-
 def test_rare_settings_are_read_from_a_file(tmp_path: Path) -> None:
     values = {"stamps": "record", "sync_tolerance_s": 0.1, "device": "cpu",
-              "iterations": 2, "half_resolution": True, "batch": 3, "terms": "stage1"}  # fmt: skip
+              "iterations": 2, "half_resolution": True, "terms": "stage1"}  # fmt: skip
     assert values.keys() == RareSettings.model_fields.keys()
     config = tmp_path / "config.yaml"
     config.write_text(yaml.safe_dump(values))
@@ -73,6 +62,6 @@ def test_missing_torch_is_reported_in_one_line(call: Call, monkeypatch: pytest.M
         if name.startswith("calibgraph.matching.cmrnext"):
             monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "torch", None)
-    code, _, line = call("weights", "iter1.tar")
+    code, _, line = call("match", SAMPLE, "--matcher", "cmrnext", "--weights", "iter1.tar")
     assert code == 2
     assert "pip install 'calibgraph[learned]'" in line and line.count("\n") == 1

@@ -99,7 +99,7 @@ def test_the_curvature_is_the_derivative_of_the_gradient(name: str, scale: float
     """
     runs = to_runs(np.array([0, 200, 600]))
     block = replace(world(LENSES[name], 600, outliers=0.0), scale=scale / 100)
-    exact = block.pixels_px + block.residuals(TRUTH)[0]
+    exact = block.pixels_px + block.residuals(T_of(TRUTH))[0]
     block = replace(block, pixels_px=exact + 0.01 * (block.pixels_px - exact))
     sums, steps = block.summarize(T_of(TRUTH), runs, curvature=True), 1e-7 * np.eye(6)
     sides = [
@@ -114,7 +114,7 @@ def test_the_curvature_is_the_derivative_of_the_gradient(name: str, scale: float
     # Of another kernel, which adds in another order.
     np.testing.assert_allclose(
         sums.hessian / whole.max(),
-        block.run_sums(T_of(TRUTH), runs).hessian / whole.max(),
+        block.summarize(T_of(TRUTH), runs).hessian / whole.max(),
         atol=1e-13,
     )
 
@@ -195,7 +195,7 @@ def test_too_few_points_give_a_singular_but_harmless_factor(count: int) -> None:
 def test_every_point_behind_the_camera_is_finite_and_bounded() -> None:
     block = world(LENSES["radtan"], 300)
     backwards = TRUTH.compose(gtsam.Pose3(gtsam.Rot3.Ry(np.pi), np.zeros(3)))
-    assert not block.residuals(backwards)[1].any()
+    assert not block.residuals(T_of(backwards))[1].any()
     graph = together(block)
     assert np.isfinite(graph.error(at(backwards)))
     found = gtsam.LevenbergMarquardtOptimizer(graph, at(backwards)).optimize()
@@ -260,7 +260,7 @@ def T_camera_lidar() -> np.ndarray:
 def test_runs_at_poses_of_their_own_have_the_sums_of_their_blocks(lens: str) -> None:
     T, scales = T_camera_lidar(), np.array([1.0, 2, 3, 4])
     for block in blocks(lens):
-        found = block.run_sums(T, to_runs(EDGES), scales)
+        found = block.summarize(T, to_runs(EDGES), scales=scales)
         for i, (first, end) in enumerate(to_runs(EDGES)):
             part = replace(block.select(np.arange(first, end)), scale=scales[i])
             expected = part.sums(poses()[1 + i])
@@ -283,7 +283,7 @@ def test_norms_are_those_of_the_residuals_and_infinite_behind_the_camera(lens: s
     T[3] = np.diag([-1.0, 1, -1, 1]) @ T[0]
     for block in blocks(lens):
         norms = block.run_norms(T, to_runs(EDGES), factor=0.5)
-        residuals, projectable = block.run_residuals(T, to_runs(EDGES))
+        residuals, projectable = block.residuals(T, to_runs(EDGES))
         assert (np.isfinite(norms) == projectable).all()
         assert not projectable.all()
         x, y = residuals.T

@@ -20,6 +20,7 @@ from calibgraph.io.bags import BagOptions
 from calibgraph.io.dataset_folders import describe_pairing
 from calibgraph.io.frame import frame_of_entry, twist_by_scans
 from calibgraph.simulation.rigs import rig_of
+from factors import displace
 from tests.conftest import SAMPLE
 from tests.io.written import written_kitti
 
@@ -95,6 +96,18 @@ def test_neighbouring_clouds_show_the_motion(tmp_path: Path) -> None:
         np.testing.assert_allclose(frame.twist_per_s[3:], twist[3:], atol=0.05)
         assert frame_of_entry(frame.entry()).twist_per_s == pytest.approx(frame.twist_per_s)
     assert load_dataset(folder, rig).frames[0].twist_per_s is None
+    still = {frame.name: frame.load_cloud()[:, :3] for frame in data.frames}
+    for name, cloud in still.items():  # as swept: what is ahead is farther in an earlier point
+        timed = np.zeros(len(cloud), [(axis, "f4") for axis in "xyzt"])
+        timed["t"] = np.linspace(0.0, 0.1, len(cloud))
+        for axis, column in zip("xyz", displace(cloud, twist, 0.05 - timed["t"]).T, strict=True):
+            timed[axis] = column
+        np.save(folder / "lidar" / f"{name}.npy", timed)
+    swept = load_dataset(folder, rig, interval_s=0.1)
+    for frame in swept.frames:
+        for one in (frame, frame_of_entry(frame.entry())):
+            np.testing.assert_allclose(one.load_cloud()[:, :3], still[frame.name], atol=0.03)
+    assert "corrected for motion by the times of their points" in " ".join(swept.notes)
     for wrong_s in (0.0, -0.1, 1e-300, 0.001, 100.0, np.inf, np.nan):
         with pytest.raises(ValueError, match="--interval-s .* 0.005 to 10 s apart"):
             load_dataset(folder, rig, interval_s=wrong_s)

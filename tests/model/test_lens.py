@@ -12,6 +12,7 @@ import pytest
 from calibgraph import (
     Camera,
     Correspondences,
+    Dataset,
     Intrinsics,
     Rig,
     dataset_from_arrays,
@@ -19,13 +20,16 @@ from calibgraph import (
     export_calibration,
     import_rig,
     load_correspondences,
+    load_dataset,
     load_rig,
 )
 from calibgraph.errors import CalibrationError, MotionError
 from calibgraph.graph.lens import LensVariable
-from calibgraph.matching.run import with_motion
+from calibgraph.matching.run import with_delays, with_motion
 from calibgraph.model.clock import at_pixels, seen_at_rows, when_taken
+from calibgraph.model.correspondences import concatenate
 from calibgraph.model.lens import IN_DOUBT, LensSigmas, lens_difference, state_calibrated
+from calibgraph.model.places import Places
 from calibgraph.simulation.rigs import rig_of
 from tests.conftest import make_camera, make_pair
 
@@ -90,8 +94,78 @@ def test_points_of_a_rolling_shutter_are_seen_at_their_rows() -> None:
 
 @pytest.mark.parametrize("name", ["table.parquet", "table.csv"])
 def test_motion_is_kept_in_tables(tmp_path: Path, name: str) -> None:
-    rows().save(tmp_path / name)
-    np.testing.assert_array_equal(load_correspondences(tmp_path / name).twist_per_s, TWISTS)
+    replace(rows(), late_s=np.array([0.03, -0.02])).save(tmp_path / name)
+    read = load_correspondences(tmp_path / name)
+    np.testing.assert_array_equal(read.twist_per_s, TWISTS)
+    np.testing.assert_array_equal(read.late_s, [0.03, -0.02])
+    joined = concatenate([read, rows()])  # points of one instant are as late as their pixels
+    np.testing.assert_array_equal(joined.late_s, [0.03, -0.02, 0.0, 0.0])
+    with pytest.raises(CalibrationError, match="late_s must be below 10 s"):
+        replace(rows(), late_s=np.array([np.nan, 0.0]))
+
+
+def test_points_of_a_sweep_are_moved_to_their_pixels() -> None:
+    """What a late point and an early pixel do to each other is their difference in time."""
+    camera, swept = rig_of("kitti").cameras["image_2"], replace(rows(), late_s=np.full(2, 0.05))
+    moved = at_pixels(camera, swept).points_lidar_m
+    earlier = rig_with(time_offset_s=-0.05).cameras["image_2"]
+    np.testing.assert_allclose(moved, at_pixels(earlier, rows()).points_lidar_m, atol=1e-12)
+    unknown = replace(swept, twist_per_s=None)
+    np.testing.assert_array_equal(at_pixels(camera, unknown).points_lidar_m, rows().points_lidar_m)
+
+
+def sweep(folder: Path, names: list[str], images: dict[str, list[str]], **times: object) -> Dataset:
+    """A folder with clouds whose points have times, and black images."""
+    rig = rig_of("kitti")
+    for name in names:
+        (folder / "lidar").mkdir(parents=True, exist_ok=True)
+        cloud = np.zeros(2, [(axis, "f8") for axis in "xyz"] + [("t", "f8")])
+        for axis, column in zip("xyz", rows().points_lidar_m.T, strict=True):
+            cloud[axis] = column
+        cloud["t"] = times.get(name, [0.0, 0.1])
+        np.save(folder / "lidar" / f"{name}.npy", cloud)
+    for camera, lens in rig.cameras.items():
+        (folder / "cameras" / camera).mkdir(parents=True, exist_ok=True)
+        for name in images.get(camera, names):
+            image = np.zeros((lens.height_px, lens.width_px), np.uint8)
+            cv2.imwrite(str(folder / "cameras" / camera / f"{name}.png"), image)
+    return load_dataset(folder, rig)
+
+
+STAMPS = ["1700000000.000000000", "1700000001.000000000"]
+TRIGGERED = ["1700000000.040000000", "1700000001.040000000"]
+
+
+@pytest.mark.parametrize(
+    ("names", "images", "times", "late_s"),
+    [
+        (["0", "1"], {}, [0.0, 0.1], [-0.05, 0.05]),  # images in the middle of the sweep
+        (["0", "1"], {}, [1.7e9, 1.7e9 + 0.1], [-0.05, 0.05]),  # stamps
+        (STAMPS, {}, [0.0, 0.1], [0.0, 0.1]),  # at the clouds' stamps
+        (STAMPS, {"image_2": TRIGGERED}, [0.0, 0.1], [-0.04, 0.06]),
+        (STAMPS, {}, [0.001, 0.002], None),  # of one instant
+        (STAMPS, {}, [0.0, 7.0], None),  # no times of one scan
+    ],
+)
+def test_points_of_a_cloud_as_swept_are_late(
+    tmp_path: Path,
+    names: list[str],
+    images: dict[str, list[str]],
+    times: list[float],
+    late_s: list[float] | None,
+) -> None:
+    data = sweep(tmp_path, names, images, **dict.fromkeys(names, times))
+    found = with_delays(rows(None), data).late_s
+    if late_s is None:
+        assert found is None
+        return
+    np.testing.assert_allclose(found, late_s, atol=1e-6)
+    stands = rows(None).with_places(Places(stationary=((0, 1),)))
+    np.testing.assert_array_equal(with_delays(stands, data).late_s, [0.0, 0.0])
+    corrected = replace(
+        data, frames=tuple(replace(f, find_motion=lambda: None) for f in data.frames)
+    )
+    assert with_delays(rows(None), corrected).late_s is None
 
 
 def test_a_table_gets_the_motion_of_its_frames() -> None:

@@ -17,9 +17,13 @@ from calibgraph import (
     solve,
 )
 from calibgraph.model.correspondences import Correspondences
+from calibgraph.model.error_sources import MOTION
 from calibgraph.model.geometry import twist_between
+from calibgraph.model.verdict import TOLERANCE
 from calibgraph.solver.joint import solve_joint
-from factors import Clock
+from calibgraph.trust.evidence import gather
+from calibgraph.trust.lens_checks import intrinsics_checks
+from factors import Clock, displace
 from tests.draws.clocks import draw_twists, put_clock_error
 from tests.draws.lenses import put_lens_error
 from tests.solver.test_lens import FIVE_SIGMAS, simulated, squared_errors
@@ -39,6 +43,38 @@ def late(
 def with_times(rig: Rig, **times: float) -> Rig:
     cameras = {name: camera.model_copy(update=times) for name, camera in rig.cameras.items()}
     return rig.model_copy(update={"cameras": cameras})
+
+
+TURN, AHEAD, ASIDE = np.eye(6)[2:5] * [[0.1], [10.0], [10.0]]
+
+
+@pytest.mark.parametrize(("number", "twist"), [(0, TURN), (1, AHEAD), (2, ASIDE)])
+def test_what_an_unknown_motion_does_to_a_sweep_is_in_the_bar(
+    number: int, twist: np.ndarray
+) -> None:
+    """Points of one camera are 20 to 40 ms late, of the other 10 ms early; both move as stated."""
+    truth, table = simulated(0, frames=10, matches=100)
+    late_s = np.where(table.camera_index == 0, 0.03 + 2e-5 * (table.pixels_px[:, 0] - 600), -0.01)
+    swept = displace(table.points_lidar_m, twist, -late_s)
+    still = gather(solve_joint(truth, replace(table, late_s=np.zeros(len(table)))), truth)
+    found = gather(solve_joint(truth, replace(table, points_lidar_m=swept, late_s=late_s)), truth)
+    assert not still.solution.travel.any()
+    assert intrinsics_checks(still) and not intrinsics_checks(found)  # a sweep looks like a lens
+    moved = np.concatenate([
+        twist_between(found.solution.T_camera_lidar[name], still.solution.T_camera_lidar[name])
+        for name in truth.cameras
+    ])  # fmt: skip
+    expected = found.solution.travel[:, number]
+    np.testing.assert_allclose(-moved, expected, atol=0.05 * np.abs(expected).max())
+    joint, known = found.joint_covariance, found.solution.covariance
+    np.testing.assert_allclose(joint - known, found.solution.travel @ found.solution.travel.T)
+    name = next(iter(truth.cameras))
+    assert found.probability_beyond(name) > 0.5 > still.probability_beyond(name)
+    sources = found.error_sources[name]
+    assert sources.translation[MOTION] > 0.9
+    assert "--motion for bags" in sources.action(TOLERANCE)
+    pair = found.pair_covariances()["->".join(truth.cameras)]
+    assert np.sqrt(pair[3, 3]) > 0.2  # 10 m/s in 40 ms
 
 
 @pytest.mark.parametrize(

@@ -28,7 +28,7 @@ from calibgraph.solver import stage1
 from calibgraph.solver.frame_weights import confidence_sigmas, fit_each_frame
 from calibgraph.solver.joint import solve_joint
 from calibgraph.solver.matches import camera_blocks
-from calibgraph.solver.pnp import fit_frames, frame_pose, move_damped, view_plane
+from calibgraph.solver.pnp import frame_pose, view_plane
 from calibgraph.solver.stage1 import T_hat, are_near_median, estimate_stage1, median_pose
 from calibgraph.solver.two_pass import optimize
 from factors import ProjectionBlock, to_runs
@@ -57,6 +57,10 @@ def far_from(rig: Rig) -> Rig:
     return perturb(rig, rotation_deg=90, translation_m=2.0)
 
 
+def stage1_of(rig: Rig, table: Correspondences) -> stage1.Stage1:
+    return estimate_stage1(rig, camera_blocks(rig, table, Config()), Config())
+
+
 def require_exact(found: stage1.Stage1, rig: Rig) -> None:
     for name, T in rig.T_camera_lidar.items():
         assert found[name].failed_frames == 0
@@ -73,7 +77,7 @@ def test_frames_of_lenses_that_see_all_round_are_solved() -> None:
         points = table.of_camera(camera).points_lidar_m
         behind = (points @ T[:3, :3].T + T[:3, 3])[:, 2] < 0
         assert behind.sum() > 0
-    require_exact(estimate_stage1(far_from(rig), table, Config()), rig)
+    require_exact(stage1_of(far_from(rig), table), rig)
 
 
 def test_magsac_finds_what_a_fit_from_a_near_guess_finds(
@@ -81,16 +85,16 @@ def test_magsac_finds_what_a_fit_from_a_near_guess_finds(
 ) -> None:
     errors = MatcherErrors(noise_px=0.0, outlier_share=0.3)
     table = simulate_correspondences(mixed_rig, frames=4, matches=200, errors=errors)
-    require_exact(estimate_stage1(far_from(mixed_rig), table, Config()), mixed_rig)
+    require_exact(stage1_of(far_from(mixed_rig), table), mixed_rig)
     monkeypatch.setattr(stage1, "ransac_pnp", None)  # so that a call of it fails
     near = perturb(mixed_rig, rotation_deg=1, translation_m=0.1)
-    require_exact(estimate_stage1(near, table, Config()), mixed_rig)
+    require_exact(stage1_of(near, table), mixed_rig)
 
 
 def test_outliers_do_not_spoil_a_frame(pair: Rig) -> None:
     errors = MatcherErrors(noise_px=1.0, outlier_share=0.4)
     table = simulate_correspondences(pair, frames=6, matches=300, errors=errors)
-    found = estimate_stage1(pair, table, Config())
+    found = stage1_of(pair, table)
     estimate = pair.moved_to(T_hat(found))
     for error in evaluate(estimate, pair).cameras.values():
         assert error.rotation_error_deg < 0.05
@@ -100,7 +104,7 @@ def test_outliers_do_not_spoil_a_frame(pair: Rig) -> None:
 def test_failed_frames_are_counted_and_dropped(pair: Rig) -> None:
     good = simulate_correspondences(pair, frames=5, matches=100)
     few = good.select((good.frame < 4) | (np.arange(len(good)) % 40 == 0))
-    found = estimate_stage1(pair, few, Config())
+    found = stage1_of(pair, few)
     assert {name: camera.failed_frames for name, camera in found.items()} == {"left": 1, "right": 1}
     assert len(found["left"].per_frame) == 4
 
@@ -118,7 +122,7 @@ def test_matches_that_leave_a_direction_free_give_no_pose(pair: Rig) -> None:
         points_lidar_m=(line - T[:3, 3]) @ T[:3, :3],
     )
     for left in (on_a_line, on_a_line.select(np.zeros(50, np.intp))):  # and in one place
-        found = estimate_stage1(pair, concatenate([left, right]), Config())
+        found = stage1_of(pair, concatenate([left, right]))
         assert list(T_hat(found)) == ["right"]
         assert {name: camera.failed_frames for name, camera in found.items()} == {
             "left": 1,
@@ -148,7 +152,7 @@ def test_stray_frames_are_recognised_without_a_reference() -> None:
 def test_the_common_start_gives_each_frame_the_pose_of_its_own_search(mixed_rig: Rig) -> None:
     errors = MatcherErrors(noise_px=1.0, frame_noise_px=1.0, outlier_share=0.3)
     table = simulate_correspondences(mixed_rig, frames=6, matches=300, errors=errors)
-    found = estimate_stage1(mixed_rig, table, Config())
+    found = stage1_of(mixed_rig, table)
     for name, camera in mixed_rig.cameras.items():
         rows = table.of_camera(name)
         for number, T in found[name].by_frame.items():
@@ -167,7 +171,7 @@ def test_every_frame_ends_where_levenberg_marquardt_of_gtsam_does(mixed_rig: Rig
         rows = table.of_camera(name)
         block = ProjectionBlock(camera.lens, rows.points_lidar_m, rows.pixels_px)
         runs = to_runs(np.append(np.unique(rows.frame, return_index=True)[1], len(rows)))
-        poses, _, found = fit_frames(block, runs, np.tile(camera.T_camera_lidar, (len(runs), 1, 1)))
+        poses, _, found = block.fit(camera.T_camera_lidar[None], runs, tolerance=1e-10)
         assert found.all()
         for run, T in zip(runs, poses, strict=True):
             alone = projection_graph(["one"], {"one": block.select(np.arange(*run))})
@@ -175,14 +179,6 @@ def test_every_frame_ends_where_levenberg_marquardt_of_gtsam_does(mixed_rig: Rig
             # Both stop where the cost changes by 1e-10 of itself: 1e-5 of a standard deviation,
             # which is 1e-3 rad and 1e-2 m for 200 matches.
             np.testing.assert_allclose(T, found, atol=1e-7)
-
-
-def test_a_free_direction_gets_no_step() -> None:
-    sums = np.zeros((1, 28))
-    sums[0, :21] = np.diag([1.0, 2, 0, 4, 5, 6])[np.triu_indices(6)]
-    sums[0, 21:27] = 1.0, 2, 0, 4, 5, 6
-    _, step = move_damped(sums, np.eye(4)[None], damping=0.0)
-    np.testing.assert_allclose(step, [[-1, -1, 0, -1, -1, -1]])
 
 
 def test_frames_that_leave_directions_free_do_not_become_singular(pair: Rig) -> None:
@@ -195,11 +191,10 @@ def test_frames_that_leave_directions_free_do_not_become_singular(pair: Rig) -> 
     pixels = np.repeat(seen.pixels_px, matches, axis=0) + rng.normal(size=(len(points), 2))
     block = ProjectionBlock(camera.lens, points, pixels)
     runs = to_runs(np.arange(0, len(points) + 1, matches))
-    T, _, found = fit_frames(block, runs, np.tile(camera.T_camera_lidar, (frames, 1, 1)))
+    T, sums, found = block.fit(camera.T_camera_lidar[None], runs, tolerance=1e-10)
     assert found.all()
     # The last step changes the cost, of 5 matches of 1 px, by 1e-10 of itself: what is left to the
     # minimum is of that size.
-    sums = block.run_sums(T, runs)
     to_minimum = np.linalg.pinv(sums.hessian, rcond=1e-9, hermitian=True)
     left = np.einsum("fi,fij,fj->f", sums.gradient, to_minimum, sums.gradient)
     assert (left <= 1e-8 * sums.cost).all()
@@ -277,7 +272,7 @@ def sigmas_learnt(sizes_of: Callable[[Array, Array], Array], count: int) -> tupl
     return confidence, confidence_sigmas(sizes_of(confidence, noise), confidence)
 
 
-@pytest.mark.parametrize(("outliers", "least", "median"), [(0.7, 0.3, 1.1), (0.9, 100.0, 400.0)])
+@pytest.mark.parametrize(("outliers", "least", "median"), [(0.7, 0.3, 1.1), (0.9, 50.0, 400.0)])
 def test_a_few_matches_that_fit_exactly_make_no_frame_precise(
     outliers: float, least: float, median: float
 ) -> None:
@@ -288,7 +283,7 @@ def test_a_few_matches_that_fit_exactly_make_no_frame_precise(
         T = rig.cameras[name].T_camera_lidar
         starts = [perturb(rig, rotation_deg=3, translation_m=0.3, seed=k) for k in range(100)]
         own = np.array([start.cameras[name].T_camera_lidar for start in starts])
-        spreads = fit_each_frame(block, own, T).spreads
+        spreads = fit_each_frame(block, own, T, most_px=10.0).spreads
         assert spreads.min() > least
         assert np.median(spreads) < median
 

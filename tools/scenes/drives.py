@@ -20,7 +20,7 @@ from calibgraph import (
     perturb,
 )
 from calibgraph.model.geometry import invert
-from calibgraph.model.pose_kernel import logarithms
+from factors.pose_kernel import logarithms
 from tests.draws.drives import simulate_drive
 from tests.draws.lenses import with_known_lenses
 

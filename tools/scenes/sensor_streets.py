@@ -32,19 +32,20 @@ def pair() -> Rig:
     """KITTI's stereo pair, of half the size."""
     lens = Intrinsics(fx=359.4, fy=359.4, cx=303.6, cy=92.6)
     places = {"left": (0.27, 0.06, -0.08), "right": (0.27, -0.48, -0.08)}
-    return Rig(cameras={n: _camera(620, 188, lens, xyz, 0.9) for n, xyz in places.items()})
+    return Rig(cameras={n: camera_at(620, 188, lens, xyz, 0.9) for n, xyz in places.items()})
 
 
 def wide() -> Rig:
     """Two cameras of 93 degrees, half to the left and half to the right."""
     lens = Intrinsics(fx=303.0, fy=303.0, cx=319.5, cy=199.5)
     views = {"left": ((0.3, 0.2, -0.2), 35.0), "right": ((0.3, -0.2, -0.2), -35.0)}
-    return Rig(cameras={n: _camera(640, 400, lens, *view) for n, view in views.items()})
+    return Rig(cameras={n: camera_at(640, 400, lens, *view) for n, view in views.items()})
 
 
-def _camera(
+def camera_at(
     width: int, height: int, lens: Intrinsics, xyz_m: tuple[float, ...], yaw_deg: float
 ) -> Camera:
+    """A level camera at a place in the LiDAR's frame, turned to the left."""
     turn, (sine, cosine) = np.eye(3), (np.sin(np.radians(yaw_deg)), np.cos(np.radians(yaw_deg)))
     turn[:2, :2] = [[cosine, sine], [-sine, cosine]]
     T = np.eye(4)

@@ -13,7 +13,7 @@ from calibgraph.errors import DatasetError, FileError
 from calibgraph.io.bags.camera_info import StatedLens, lens_of, stated_baseline
 from calibgraph.io.bags.messages import CAMERA_INFO, Bag, open_drive
 from calibgraph.io.bags.storage import BagOptions
-from calibgraph.io.bags.topics import CameraTopics, choose_topics
+from calibgraph.io.bags.topics import RigTopics, choose_topics, is_rectified
 from calibgraph.io.bags.transforms import Transforms
 from calibgraph.io.lenses import CameraLens
 from calibgraph.io.rig_parts import RigParts, find_mounts
@@ -36,8 +36,8 @@ def read_bag_rig(path: Path, options: BagOptions | None = None) -> RigParts:
     chosen = choose_topics(bag, options.topics, drive=drive)
     lidar = bag.first(chosen.lidar).header.frame_id.lstrip("/")
     reader = _CameraReader(drive, lidar)
-    for name, topics in chosen.cameras.items():
-        reader.read(name, topics)
+    for name in chosen.images:
+        reader.read(name, chosen)
     counts = Counter([lidar, *reader.frame_ids.values()])
     shared = {frame: names for frame, names in reader.by_frame.items() if names[1:]}
     both = [f"{' and '.join(names)} name one frame, {frame!r}" for frame, names in shared.items()]
@@ -83,20 +83,21 @@ class _CameraReader:
         self.by_frame: dict[str, list[str]] = {}
         self.why_missing: dict[str, str] = {}
 
-    def read(self, name: str, topics: CameraTopics) -> None:
+    def read(self, name: str, topics: RigTopics) -> None:
         """Read a camera; its extrinsic may be missing."""
-        if topics.info is None:
+        if name in topics.unclear:
             raise DatasetError(
-                f"{self._drive[0].path}: {_why_no_info(name, topics)}, or calibrate "
+                f"{self._drive[0].path}: {topics.unclear[name]}, or calibrate "
                 f"with a rig that has the lens of camera {name!r} (--rig)",
                 camera=name,
             )
-        bag = next(bag for bag in self._drive if bag.has(topics.info))
+        info = topics.infos[name]
+        bag = next(bag for bag in self._drive if bag.has(info))
         if bag is not self._drive[0]:
-            self.notes.append(f"{self._drive[0].path}: {topics.info} is that of {bag.path}")
-        where = f"{bag.path}: {topics.info}"
-        lens = _first_lens(bag, topics, where)
-        with_baseline = self._counts_baseline(name, lens, bag, topics.info)
+            self.notes.append(f"{self._drive[0].path}: {info} is that of {bag.path}")
+        where = f"{bag.path}: {info}"
+        lens = _first_lens(bag, info, where, rectified=is_rectified(topics.images[name]))
+        with_baseline = self._counts_baseline(name, lens, bag, info)
         self.lenses[name] = lens.lens
         if not with_baseline:
             self.by_frame.setdefault(lens.frame, []).append(name)
@@ -150,23 +151,12 @@ class _CameraReader:
         return None
 
 
-def _why_no_info(name: str, topics: CameraTopics) -> str:
-    """Why no CameraInfo is an image's, and what to do."""
-    if not topics.infos:
-        return f"{topics.image} has no camera_info beside it; record it"
-    also = f", which may be that of {', '.join(topics.rivals)} too" if topics.rivals else ""
-    return (
-        f"which camera_info is that of {topics.image}? There is {', '.join(topics.infos)}{also}; "
-        f"name both: --topic {quote(name)}={topics.image},/CAMERA_INFO"
-    )
-
-
-def _first_lens(bag: Bag, topics: CameraTopics, where: str) -> StatedLens:
+def _first_lens(bag: Bag, info: str, where: str, *, rectified: bool) -> StatedLens:
     """The lens of the first CameraInfo that has one: some drivers begin with zeros."""
     error: FileError | None = None
-    for message in islice(bag.messages([topics.infos[0]]), _MOST_WITHOUT_LENS):
+    for message in islice(bag.messages([info]), _MOST_WITHOUT_LENS):
         try:
-            return lens_of(message.content, where, rectified=topics.rectified)
+            return lens_of(message.content, where, rectified=rectified)
         except FileError as found:
             error = error or found
     raise error or FileError(where, "has no message")

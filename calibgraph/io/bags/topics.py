@@ -40,40 +40,29 @@ _NOT_READ = {
 
 
 @dataclass(frozen=True)
-class CameraTopics:
-    """The topics of a camera: ``infos`` may be its CameraInfo, or that of the images ``rivals``."""
-
-    image: str
-    infos: tuple[str, ...]
-    rivals: tuple[str, ...] = ()
-
-    @property
-    def rectified(self) -> bool:
-        """Whether the images are, by their name."""
-        return "rect" in _base(self.image).rsplit("/", 1)[-1]
-
-    @property
-    def info(self) -> str | None:
-        """The CameraInfo; None if there is none, or it could be another."""
-        return self.infos[0] if len(self.infos) == 1 and not self.rivals else None
-
-
-@dataclass(frozen=True)
 class RigTopics:
     """The topics of a LiDAR and of cameras, by the cameras' names; ``notes`` name others.
 
-    Of several LiDARs ``lidar`` is the base, and ``lidars`` are those of the others.
+    ``infos`` are the CameraInfo of images, ``unclear`` why others have none. Of several LiDARs
+    ``lidar`` is the base, and ``lidars`` are those of the others.
     """
 
     lidar: str
-    cameras: Mapping[str, CameraTopics]
+    images: Mapping[str, str]
+    infos: Mapping[str, str]
+    unclear: Mapping[str, str]
     notes: tuple[str, ...] = ()
     lidars: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def paired(self) -> dict[str, str]:
         """The topics that are paired with the LiDAR's clouds: of images, and of other LiDARs."""
-        return {name: each.image for name, each in self.cameras.items()} | dict(self.lidars)
+        return {**self.images, **self.lidars}
+
+
+def is_rectified(image: str) -> bool:
+    """Whether the images of a topic are, by its name."""
+    return "rect" in _base(image).rsplit("/", 1)[-1]
 
 
 def choose_topics(
@@ -115,7 +104,7 @@ def choose_topics(
         found = {**_found_cameras(bag, None), **found}
     if not names and not lidars:
         raise DatasetError(f"{bag.path}: {_why_no_camera(bag, infos)}")
-    topics = {}
+    images, of_images, unclear = dict[str, str](), dict[str, str](), dict[str, str]()
     for name in names:
         image, *info = chosen.get(name) or [found.get(name, "")]
         if not image:
@@ -124,20 +113,33 @@ def choose_topics(
                 f"it by --topic {quote(name)}=/TOPIC",
                 camera=name,
             )
-        topics[name] = (
-            CameraTopics(image, tuple(info)) if info
-            else CameraTopics(image, infos.of(image), infos.rivals(image))
-        )  # fmt: skip
-    unused = tuple(_unused(bag, infos, topics.values()))
+        images[name] = image
+        possible, rivals = (info, ()) if info else (infos.of(image), infos.rivals(image))
+        if len(possible) == 1 and not rivals:
+            of_images[name] = possible[0]
+        else:
+            unclear[name] = _why_no_info(name, image, possible, rivals)
+    of_cameras = images, of_images, unclear, tuple(_unused(bag, infos, images.values()))
     if lidars:
         base, *others = (named.get(name) or _topic_of_lidar(bag, name) for name in lidars)
-        return RigTopics(base, topics, unused, dict(zip(lidars[1:], others, strict=True)))
-    return RigTopics(named.get(LIDAR) or _lidar_topic(bag), topics, unused)
+        return RigTopics(base, *of_cameras, dict(zip(lidars[1:], others, strict=True)))
+    return RigTopics(named.get(LIDAR) or _lidar_topic(bag), *of_cameras)
 
 
-def _unused(bag: Bag, infos: _Infos, used: Iterable[CameraTopics]) -> Iterable[str]:
+def _why_no_info(name: str, image: str, infos: Sequence[str], rivals: Sequence[str]) -> str:
+    """Why no CameraInfo is an image's, and what to do."""
+    if not infos:
+        return f"{image} has no camera_info beside it; record it"
+    also = f", which may be that of {', '.join(rivals)} too" if rivals else ""
+    return (
+        f"which camera_info is that of {image}? There is {', '.join(infos)}{also}; "
+        f"name both: --topic {quote(name)}={image},/CAMERA_INFO"
+    )
+
+
+def _unused(bag: Bag, infos: _Infos, used: Iterable[str]) -> Iterable[str]:
     """A line for each image topic with a CameraInfo that no camera has."""
-    taken = {_words(each.image) for each in used}
+    taken = {*map(_words, used)}
     for each in bag.of_type(*_NOT_READ):
         if _NOT_READ[each.type].startswith("video"):
             yield f"{bag.path}: {each.name} is {_NOT_READ[each.type]}"

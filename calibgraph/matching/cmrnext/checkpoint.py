@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 import warnings
@@ -18,10 +17,8 @@ from pydantic import BaseModel, Field, StrictBool
 from torch import Tensor
 
 from calibgraph.errors import FileError, in_words
-from calibgraph.files import checked_model, sha256, write_atomically
+from calibgraph.files import checked_model, sha256
 from calibgraph.matching.cmrnext.network import Architecture, CmrNext
-
-SAFETENSORS = ".safetensors"
 
 DOWNLOAD = (
     "the published weights are at "
@@ -70,40 +67,15 @@ class Checkpoint:
         rotation, translation = (self.config.get(key) for key in ("max_r", "max_t"))
         return (float(rotation), float(translation)) if rotation and translation else None
 
-    def summary(self) -> dict[str, Any]:
-        """File, hash, number of parameters, architecture and config, as plain values."""
-        return {
-            "file": str(self.path),
-            "sha256": self.sha256,
-            "parameters": sum(t.numel() for name, t in self.state.items() if _is_parameter(name)),
-            "network": asdict(self.architecture),
-            "config": self.config,
-        }
-
     def network(self, device: str | torch.device = "cpu") -> CmrNext:
         """The network with these weights, for evaluation."""
         model = CmrNext(self.architecture)
         model.load_state_dict(self.state)
         return model.to(device).eval()
 
-    def save_safetensors(self, path: Path) -> None:
-        """Write the weights and their config as a .safetensors file."""
-        from safetensors.torch import save_file
-
-        metadata = {"format": "calibgraph-cmrnext/1", "config": json.dumps(self.config)}
-        # Some tensors are stored under two names; safetensors requires separate memory.
-        state = {name: tensor.clone().contiguous() for name, tensor in self.state.items()}
-        write_atomically(path, lambda temporary: save_file(state, temporary, metadata))
-
-
-def _is_parameter(name: str) -> bool:
-    """Whether an entry of a state dict is neither a second name nor a running statistic."""
-    statistics = ("running_mean", "running_var", "num_batches_tracked")
-    return ".downsample.1." not in name and not name.endswith(statistics)
-
 
 def load_checkpoint(path: Path | str) -> Checkpoint:
-    """Read weights, from a published ``.tar`` (``torch.save``) or a ``.safetensors``.
+    """Read weights as they are published, written by ``torch.save``.
 
     Nothing in the file is executed.
 
@@ -113,11 +85,10 @@ def load_checkpoint(path: Path | str) -> Checkpoint:
     """
     path = Path(path)
     if path.exists() and not path.is_file():
-        raise FileError(path, "is not a file; expected weights, .tar or .safetensors")
+        raise FileError(path, "is not a file; expected weights, as iter1.tar")
     if not path.exists():
         raise FileError(path, f"no such file of weights; {DOWNLOAD}")
-    read = _read_safetensors if path.suffix == SAFETENSORS else _read_torch
-    return _to_checkpoint(path, *read(path))
+    return _to_checkpoint(path, *_read_torch(path))
 
 
 def _to_checkpoint(
@@ -159,25 +130,6 @@ def _read_torch(path: Path) -> tuple[dict[Any, Any], dict[str, Tensor]]:
     return content["config"], tensors
 
 
-def _read_safetensors(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    from safetensors import SafetensorError, safe_open
-
-    try:
-        if path.stat().st_size > MAX_BYTES:
-            raise ValueError(f"{path.stat().st_size} bytes, expected at most {MAX_BYTES}")
-        with safe_open(path, framework="pt") as file:
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-            text = (file.metadata() or {}).get("config")
-        config = None if text is None else json.loads(text)
-    except (SafetensorError, ValueError, OSError, RecursionError, KeyError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-        raise FileError(path, f"cannot be read as safetensors: {reason}") from None
-    if not isinstance(config, dict):
-        convert = "calibgraph weights ORIGINAL.tar --out NEW.safetensors"
-        raise FileError(path, f"has no config in its metadata; convert the original by {convert}")
-    return config, tensors
-
-
 def _is_plain(value: Any) -> bool:
     if isinstance(value, str):
         return len(value) <= _MAX_TEXT and value.isprintable()
@@ -203,13 +155,7 @@ def _copy_state(architecture: Architecture, tensors: Mapping[str, Tensor]) -> di
             network = ", ".join(f"{key} {value}" for key, value in asdict(architecture).items())
             found, wanted = tuple(tensors[name].shape), tuple(like.shape)
             raise ValueError(f"{name!r} has shape {found}, expected {wanted}, with {network}")
-    state = {name: _copy(name, tensors[name], like) for name, like in expected.items()}
-    for name, tensor in state.items():
-        if ".norm3." in name and not torch.equal(
-            tensor, state[name.replace(".norm3.", ".downsample.1.")]
-        ):
-            raise ValueError(f"{name!r} and its copy under 'downsample.1' differ")
-    return state
+    return {name: _copy(name, tensors[name], like) for name, like in expected.items()}
 
 
 def _copy(name: str, tensor: Tensor, like: Tensor) -> Tensor:

@@ -91,39 +91,30 @@ class FlowMatcher:
     iterations: int
     half_resolution: bool | None
 
-    def match(self, jobs: Sequence[MatchingJob]) -> list[Correspondences]:
-        """Match a batch of images of one size; the tables do not depend on a frame's pose."""
-        is_wide, given = jobs[0].camera.width_px >= HALVED_FROM_PX, self.half_resolution
+    def match(self, job: MatchingJob) -> Correspondences:
+        """Match an image; the table does not depend on a frame's pose."""
+        is_wide, given = job.camera.width_px >= HALVED_FROM_PX, self.half_resolution
         halved = is_wide if given is None else given
-        lidar_images = [LidarImage.render(j.cloud, j.T_camera_lidar, j.view) for j in jobs]
-        full, coarse = self._flow(jobs, lidar_images, halved)
-        cell = CELL * (1 + halved)
-        return [
-            to_table(job, lidar, full[i], coarse[i], cell=cell)
-            for i, (job, lidar) in enumerate(zip(jobs, lidar_images, strict=True))
-        ]
+        lidar = LidarImage.render(job.cloud, job.T_camera_lidar, job.view)
+        full, coarse = self._flow(job, lidar, halved)
+        return to_table(job, lidar, full, coarse, cell=CELL * (1 + halved))
 
-    def _flow(
-        self, jobs: Sequence[MatchingJob], lidar_images: Sequence[LidarImage], halved: bool
-    ) -> tuple[Maps, Maps]:
-        """(B, 2, H, W) flow, (B, 2, h, w) last step and peak."""
+    def _flow(self, job: MatchingJob, lidar: LidarImage, halved: bool) -> tuple[Maps, Maps]:
+        """(2, H, W) flow, (2, h, w) last step and peak."""
         checkpoint, device = self.checkpoint, next(self.model.parameters()).device
-        rgbs, lidars = [], []
-        for job, lidar in zip(jobs, lidar_images, strict=True):
-            image = job.image[::2, ::2] if halved else job.image
-            channels = lidar_channels(lidar, checkpoint.architecture, checkpoint.max_depth_m)
-            rgbs.append(rgb_tensor(image, normalize=checkpoint.config["normalize_images"]))
-            lidars.append(lidar_tensor(halve_lidar(channels) if halved else channels))
+        image = job.image[::2, ::2] if halved else job.image
+        channels = lidar_channels(lidar, checkpoint.architecture, checkpoint.max_depth_m)
+        rgb = rgb_tensor(image, normalize=checkpoint.config["normalize_images"])
+        raw = lidar_tensor(halve_lidar(channels) if halved else channels)
         exact: Any = torch.backends.cudnn.flags(  # full float32, the same numbers at every call
             enabled=True, benchmark=False, deterministic=True, allow_tf32=False
         )
         with torch.inference_mode(), exact:
-            rgb, raw = torch.stack(rgbs).to(device), torch.stack(lidars).to(device)
-            inputs = encode_depth(raw, checkpoint.architecture)
-            flow = self.model(rgb, inputs, iterations=self.iterations)
+            inputs = encode_depth(raw[None].to(device), checkpoint.architecture)
+            flow = self.model(rgb[None].to(device), inputs, iterations=self.iterations)
             full = upscale(flow.flow_px, halved=halved)
             coarse = torch.stack([flow.step_px * (1 + halved), flow.peak], dim=1)
-            return full.cpu().numpy(), coarse.cpu().numpy()
+            return full[0].cpu().numpy(), coarse[0].cpu().numpy()
 
 
 def to_table(

@@ -1,8 +1,7 @@
 """The matcher ``cmrnext``: a schedule of networks from coarse to fine, and its findings."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +28,6 @@ from calibgraph.model.rig import Camera, Rig
 from calibgraph.progress import Progress
 from calibgraph.solver.pnp import frame_pose
 
-_BATCH = {"cpu": 1, "cuda": 4}
 _PROBED_FRAMES = 5  # per camera
 _BEYOND = 2.0  # times the range of training, corner to corner: no network corrects by more
 
@@ -46,7 +44,6 @@ class CmrNextMatcher:
         device: ``cpu``, ``cuda``, or ``auto``.
         iterations: of the recurrent update.
         half_resolution: whether images are halved; None: from 1400 pixels width on.
-        batch: images at once; None: 1 on a CPU, 4 on a GPU.
         seed: of PnP.
 
     Raises:
@@ -64,17 +61,15 @@ class CmrNextMatcher:
         device: str = "auto",
         iterations: int = 12,
         half_resolution: bool | None = None,
-        batch: int | None = None,
         seed: int = 0,
     ) -> None:
         if not weights:
             raise ValueError("no weights given: --weights iter1.tar --weights iter5.tar")
-        if iterations < 1 or (batch is not None and batch < 1):
-            raise ValueError(f"iterations {iterations}, batch {batch}: expected at least 1")
+        if iterations < 1:
+            raise ValueError(f"iterations {iterations}: expected at least 1")
         self.device = torch_device(device)
         self.iterations = iterations
         self.half_resolution = half_resolution
-        self.batch = batch or _BATCH[self.device.type]
         self.seed = seed
         loaded = {path: self._load(path) for path in dict.fromkeys(map(str, weights))}
         self.networks = [loaded[str(path)] for path in weights]
@@ -83,18 +78,16 @@ class CmrNextMatcher:
         self, dataset: Dataset, rig: Rig, *, round_index: int, progress: Progress
     ) -> Correspondences:
         """Match every camera in every frame, from the rig's extrinsics."""
-        last = self.networks[-1]
+        views = {name: View(camera, crop_even=True) for name, camera in rig.cameras.items()}
         probed = {frame.index for frame in spread_out(dataset.frames, _PROBED_FRAMES)}
-        total = len(rig.cameras) * len(dataset.frames)
         results: dict[str, list[ImageResult]] = {name: [] for name in rig.cameras}
-        done = 0
-        for jobs in self._batches(dataset, rig):
-            progress(f"matching {jobs[0].frame.name}", done, total)
-            for result in self._run(jobs):
-                if result.job.frame.index in probed:
-                    result = self._probe(result, last)  # noqa: PLW2901
-                results[result.job.name].append(result)
-            done += len(jobs)
+        for done, frame in enumerate(dataset.frames):
+            progress(f"matching {frame.name}", done, len(dataset.frames))
+            for name, camera in rig.cameras.items():
+                result = self._run(load_job(frame, name, camera, views[name]))
+                if frame.index in probed:
+                    result = self._probe(result, self.networks[-1])
+                results[name].append(result)
         # Of a camera whose images all failed, all are given: the solve reports the failure.
         good = [[r for r in each if not r.failed] or each for each in results.values()]
         tables = [result.matches for each in good for result in each]
@@ -116,37 +109,15 @@ class CmrNextMatcher:
             half_resolution=self.half_resolution,
         )
 
-    def _batches(self, dataset: Dataset, rig: Rig) -> Iterator[list[MatchingJob]]:
-        """Jobs of equal image size, frame by frame; loaded when they are needed."""
-        views = {name: View(camera, crop_even=True) for name, camera in rig.cameras.items()}
-
-        def size(name: str) -> tuple[int, int]:
-            return views[name].height, views[name].width
-
-        for _, group in groupby(sorted(rig.cameras, key=size), key=size):
-            names = list(group)
-            pairs = [(frame, name) for frame in dataset.frames for name in names]
-            for start in range(0, len(pairs), self.batch):
-                yield [load_job(frame, name, rig.cameras[name], views[name])
-                       for frame, name in pairs[start : start + self.batch]]  # fmt: skip
-
-    def _run(self, jobs: Sequence[MatchingJob]) -> list[ImageResult]:
-        """Run the networks on a batch, each from the estimates of the one before."""
-        failed = [False] * len(jobs)
+    def _run(self, job: MatchingJob) -> ImageResult:
+        """Run the networks on an image, each from the estimate of the one before."""
+        failed = False
         for network in self.networks:
-            tables = network.match(jobs)
-            results = [
-                self._estimate(job, table, network.checkpoint, before)
-                for job, table, before in zip(jobs, tables, failed, strict=True)
-            ]
-            failed = [result.failed for result in results]
-            jobs = [  # of the next network: from the new estimate, unless it failed
-                r.job
-                if r.failed or r.T_camera_lidar is None
-                else replace(r.job, T_camera_lidar=r.T_camera_lidar)
-                for r in results
-            ]
-        return results
+            result = self._estimate(job, network.match(job), network.checkpoint, failed)
+            failed = result.failed
+            if result.T_camera_lidar is not None and not failed:
+                job = replace(job, T_camera_lidar=result.T_camera_lidar)
+        return result
 
     def _estimate(
         self, job: MatchingJob, table: Correspondences, checkpoint: Checkpoint, failed: bool
@@ -166,7 +137,7 @@ class CmrNextMatcher:
         start = displace(base, network.checkpoint.range_deg_m, rng)
         blank = np.full_like(job.image, BLANK)
         with_image, without_image = (
-            network.match([replace(job, T_camera_lidar=start, image=image)])[0]
+            network.match(replace(job, T_camera_lidar=start, image=image))
             for image in (job.image, blank)
         )
         dependence, kept = (

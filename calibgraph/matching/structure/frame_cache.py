@@ -14,10 +14,6 @@ from calibgraph.memory import mmap_copy
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.parallel import KeyedCache
 
-FileVersion = tuple[Path, int, int]
-"""Path, time of the last change [ns] and size [bytes]: a file that has changed is decoded again."""
-
-
 MAX_IMAGE_BYTES, MAX_CLOUD_BYTES, MAX_SMALL_BYTES = 1_500_000_000, 500_000_000, 600_000_000
 
 
@@ -28,19 +24,16 @@ class FrameCache:
     """
 
     def __init__(self) -> None:
-        self._clouds: KeyedCache[tuple[FileVersion, ScanMotion | None], PreparedCloud] = KeyedCache(
-            MAX_CLOUD_BYTES
-        )
-        self._images: KeyedCache[tuple[FileVersion, int, int], PreparedImage] = KeyedCache(
-            MAX_IMAGE_BYTES
-        )
+        self._clouds: KeyedCache[tuple[Path, ScanMotion | None], PreparedCloud]
+        self._images: KeyedCache[tuple[Path, int, int], PreparedImage]
+        self._clouds, self._images = KeyedCache(MAX_CLOUD_BYTES), KeyedCache(MAX_IMAGE_BYTES)
         self._tables, self._smaller = WindowTables(), SmallImages(MAX_SMALL_BYTES)
 
     def keep_only(self, frames: Iterable[Frame]) -> None:
         """Drop all other frames: memory stays bounded along a drive."""
         kept = {path for f in frames for path in (f.cloud_path, *f.image_paths.values())}
-        self._clouds.keep_only(lambda key: key[0][0] in kept)
-        self._images.keep_only(lambda key: key[0][0] in kept)
+        self._clouds.keep_only(lambda key: key[0] in kept)
+        self._images.keep_only(lambda key: key[0] in kept)
         self._tables.keep_only(cloud.identity for cloud in self._clouds.values())
         images = {image.identity for image in self._images.values()}
         self._smaller.keep_only(lambda key: key[0] in images)
@@ -48,13 +41,13 @@ class FrameCache:
     def cloud(self, frame: Frame) -> PreparedCloud:
         """The frame's cloud."""
         return self._clouds.get(
-            (_file_version(frame.cloud_path), frame.motion),
+            (frame.cloud_path, frame.motion),
             lambda: PreparedCloud.from_points(frame.load_cloud(), self._tables),
         )
 
     def image(self, frame: Frame, name: str, camera: Camera) -> PreparedImage:
         """The camera's image; its size is checked against the camera's."""
-        key = (_file_version(frame.image_paths[name]), camera.width_px, camera.height_px)
+        key = (frame.image_paths[name], camera.width_px, camera.height_px)
 
         def load() -> PreparedImage:
             gray = frame.load_gray(name, camera)
@@ -85,12 +78,3 @@ def load_camera_frames(
         )
         for name, camera in rig.cameras.items()
     }
-
-
-def _file_version(path: Path) -> FileVersion:
-    """The version of a file; zeros if it is missing, which the decoder reports."""
-    try:
-        found = path.stat()
-    except OSError:
-        return path, 0, 0
-    return path, found.st_mtime_ns, found.st_size

@@ -198,7 +198,13 @@ def test_stamps_tell_when_each_camera_takes_its_image(tmp_path: Path) -> None:
     stated = RIG.model_copy(update={"cameras": {**RIG.cameras, first: known}})
     again = load_dataset(path, stated, bag=BagOptions(motion="odometry")).rig.cameras
     assert again[first].time_offset_s == 0.001  # noqa: RUF069
-    assert load_dataset(path).rig.cameras[last].time_offset_s is None
+    swept = load_dataset(path)
+    assert swept.rig.cameras[last].time_offset_s is None
+    after_s = [swept.frames[1].image_after_s(name) for name in (first, last)]
+    assert after_s == [pytest.approx(IMAGE_S - 0.02), pytest.approx(IMAGE_S + 0.005)]
+    found = swept.frames[1].load_sweep()
+    assert found is not None and data.frames[1].load_sweep() is None  # it is corrected
+    assert (found[1].min(), found[1].max()) == (0.0, pytest.approx(0.1))
 
 
 def test_times_that_are_all_equal_are_named_if_motion_is_to_be_corrected(

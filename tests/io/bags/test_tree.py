@@ -28,7 +28,7 @@ from calibgraph import (
 from calibgraph.io.bags.camera_info import lens_of
 from calibgraph.io.bags.messages import Bag
 from calibgraph.io.bags.rig import doubtful_axes
-from calibgraph.io.bags.topics import choose_topics
+from calibgraph.io.bags.topics import choose_topics, is_rectified
 from calibgraph.io.bags.transforms import Transforms
 from calibgraph.io.rig_parts import Link, find_mounts
 from calibgraph.model.geometry import invert
@@ -96,15 +96,14 @@ CHOSEN: dict[str, tuple[tuple[str, ...], dict[str, str]]] = {
 @pytest.mark.parametrize("name", CHOSEN)
 def test_topics_of_images_are_chosen_and_named(name: str, tmp_path: Path) -> None:
     topics, expected = CHOSEN[name]
-    cameras = choose_topics(bag_of(tmp_path, *topics), {}).cameras
-    assert {name: each.image for name, each in cameras.items()} == expected
-    assert all(each.rectified == ("image_rect" in each.image) for each in cameras.values())
+    images = choose_topics(bag_of(tmp_path, *topics), {}).images
+    assert images == expected
+    assert all(is_rectified(each) == ("image_rect" in each) for each in images.values())
 
 
 def test_a_rig_with_the_lens_finds_images_by_the_names_that_they_would_have(tmp_path: Path) -> None:
     bag = bag_of(tmp_path, *CHOSEN["no depth, and no image without a lens"][0])
-    wanted = choose_topics(bag, {}, ["color", "ouster"]).cameras
-    assert {name: each.image for name, each in wanted.items()} == {
+    assert choose_topics(bag, {}, ["color", "ouster"]).images == {
         "color": "/d435/color/image_raw", "ouster": "/ouster/signal_image",
     }  # fmt: skip
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import os
 import pickle
 import re
@@ -11,7 +10,6 @@ import resource
 import struct
 import time
 import zipfile
-from collections import OrderedDict
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -78,9 +76,6 @@ BAD: dict[str, tuple[Callable[[Path], None], str]] = {
     "negative variances": (
         changed_weights(cnet__norm1__running_var=-torch.ones(8)), "variances below zero",
     ),
-    "copies that differ": (
-        changed_weights(**{"cnet.layer2.0.norm3.bias": torch.ones(12)}), "differ",
-    ),
     "no mapping": (lambda path: torch.save([1], path), "no mapping"),
     "no config": (with_weights(lambda c: c.pop("config")), "lacks 'config'"),
     "a state dict of texts": (
@@ -112,43 +107,6 @@ BAD: dict[str, tuple[Callable[[Path], None], str]] = {
         changed_weights(fnet_img__conv1__weight=torch.zeros(8 * 10**12, 0, 7, 7)), "network width",
     ),
 }  # fmt: skip
-
-
-def safetensors(config: str | None, length: int | None = None) -> Callable[[Path], None]:
-    def write(path: Path) -> None:
-        metadata = {} if config is None else {"__metadata__": {"config": config}}
-        header = json.dumps(metadata).encode()
-        path.write_bytes(struct.pack("<Q", length or len(header)) + header)
-
-    return write
-
-
-SAFETENSORS: dict[str, tuple[Callable[[Path], None], str]] = {
-    "no config beside the weights": (safetensors(None), "no config"),
-    "a config that is a list": (safetensors("[1]"), "no config"),
-    "a config that is no JSON": (safetensors("{"), "cannot be read"),
-    "a header of 10 GB": (safetensors("{}", 10 * 2**30), "cannot be read"),
-    "an empty config": (safetensors("{}"), "max_depth"),
-}
-
-
-def test_bfloat16_safetensors_are_read(tmp_path: Path) -> None:
-    from safetensors.torch import save_file
-
-    content = good_content()
-    state = {k: (v.bfloat16() if v.is_floating_point() else v.clone()).contiguous()
-             for k, v in content["state_dict"].items()}  # fmt: skip
-    path = tmp_path / "a.safetensors"
-    save_file(state, path, {"config": json.dumps(content["config"])})
-    checkpoint = load_checkpoint(path)
-    torch.testing.assert_close(
-        checkpoint.state["cnet.conv2.bias"], content["state_dict"]["cnet.conv2.bias"],
-        atol=0, rtol=2**-8,
-    )  # fmt: skip
-
-
-STORAGE_0 = 8 * 3 * 7 * 7
-"""Numbers in the first storage of a good checkpoint: its first convolution's weights."""
 
 
 def test_wrapped_half_and_strided_weights_are_read(tmp_path: Path) -> None:
@@ -195,37 +153,6 @@ def repacked(path: Path, replacements: dict[str, bytes], compress: bool = False)
             new.writestr(entry.filename, replacements.get(name, old.read(entry)))
 
 
-def tensor_pickle(size: tuple[int, ...], stride: tuple[int, ...], count: int) -> bytes:
-    """A pickle of {config, state_dict} whose tensor claims a size."""
-
-    class Storage:
-        pass
-
-    class Claim:
-        def __reduce__(self) -> tuple[Any, ...]:
-            rebuild = torch._utils._rebuild_tensor_v2
-            return rebuild, (Storage(), 0, size, stride, False, OrderedDict())
-
-    class Pickler(pickle.Pickler):
-        def persistent_id(self, obj: Any) -> Any:
-            if isinstance(obj, Storage):
-                return ("storage", torch.FloatStorage, "0", "cpu", count)
-            return None
-
-    out = io.BytesIO()
-    Pickler(out, 2).dump({"config": CONFIG, "state_dict": {"fnet_lidar.conv1.weight": Claim()}})
-    return out.getvalue()
-
-
-BIG = (2_500_000_000,)
-
-
-def claim(
-    size: tuple[int, ...], stride: tuple[int, ...], count: int = STORAGE_0
-) -> Callable[[Path], None]:
-    return lambda path: repacked(path, {"data.pkl": tensor_pickle(size, stride, count)})
-
-
 def pickled_command(path: Path) -> None:
     path.write_bytes(pickle.dumps(Command(path.parent / "executed")))
 
@@ -245,11 +172,6 @@ def truncated(path: Path) -> None:
 
 def zeros_packed(path: Path) -> None:
     repacked(path, {"data/0": bytes(2**24)}, compress=True)
-
-
-def program(body: bytes) -> Callable[[Path], None]:
-    """A good checkpoint whose pickle is replaced."""
-    return lambda path: repacked(path, {"data.pkl": body})
 
 
 def overlapping(path: Path) -> None:
@@ -276,31 +198,19 @@ HOSTILE: dict[str, tuple[Callable[[Path], None], str]] = {
     "a zip whose pickle runs a command": (zipped_command, "posix is blocked"),
     "a command in place of weights": (command_beside_weights, "posix is blocked"),
     "truncated": (truncated, "damaged"),
-    "a tensor that claims 10 GB": (claim(BIG, (1,)), "not resizable"),
-    "a tensor of 2^124 numbers": (claim((2**62, 2**62), (2**62, 1)), "overflow"),
     "packed zeros": (zeros_packed, "packed"),
     "overlapping entries": (overlapping, "more bytes than the file has"),
-    "a memo of 2^31 places": (program(b"\x80\x02Nr\xff\xff\xff\x7f."), "no mapping"),
-    "an array of 2^52 bytes": (
-        program(b"\x80\x02c__builtin__\nbytearray\n\x8a\7\0\0\0\0\0\0\x10\x85R."),
-        "more memory than there is",
-    ),
-    "an instruction cut short": (program(b"\x80\x02r\x00"), "ends too early"),
     "an empty file": (lambda path: path.write_bytes(b"") and None, "not a checkpoint"),
 }  # fmt: skip
 
 
-REFUSED = {
-    **{name: ("iter1.tar", write, re.escape(said)) for name, (write, said) in BAD.items()},
-    **{name: ("a.safetensors", *row) for name, row in SAFETENSORS.items()},
-    **{name: ("iter1.tar", *row) for name, row in HOSTILE.items()},
-}
+REFUSED = {name: (write, re.escape(said)) for name, (write, said) in (BAD | HOSTILE).items()}
 
 
 @pytest.mark.parametrize("name", REFUSED)
 def test_unsound_and_hostile_files_are_refused_in_one_line(tmp_path: Path, name: str) -> None:
-    file, write, message = REFUSED[name]
-    path = tmp_path / file
+    write, message = REFUSED[name]
+    path = tmp_path / "iter1.tar"
     write(path)
     start, memory_kb = time.process_time(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     with pytest.raises(FileError, match=message) as caught:

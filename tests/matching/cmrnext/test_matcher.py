@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -33,19 +32,16 @@ def replace_networks(
 ) -> None:
     """Let every network return the true flow; from a blank image only if it is memorised."""
 
-    def match(network: FlowMatcher, jobs: Sequence[MatchingJob]) -> list[Correspondences]:
-        tables = []
-        for job in jobs:
-            lidar = LidarImage.render(job.cloud, job.T_camera_lidar, job.view)
-            informed = memorised or job.image.std(axis=(0, 1)).any()
-            T = truth[job.name] if informed else job.T_camera_lidar
-            points = job.cloud[lidar.point_index, :3].astype(np.float64)
-            target = job.view.project(points @ T[:3, :3].T + T[:3, 3])
-            full = np.zeros((2, *network_size(*lidar.shape)), np.float32)
-            full[:, lidar.cells[:, 0], lidar.cells[:, 1]] = (target - lidar.pixels_px).T
-            coarse = np.stack([np.zeros_like(full[0]), np.ones_like(full[0])])[:, ::8, ::8]
-            tables.append(to_table(job, lidar, full, coarse, cell=8))
-        return tables
+    def match(network: FlowMatcher, job: MatchingJob) -> Correspondences:
+        lidar = LidarImage.render(job.cloud, job.T_camera_lidar, job.view)
+        informed = memorised or job.image.std(axis=(0, 1)).any()
+        T = truth[job.name] if informed else job.T_camera_lidar
+        points = job.cloud[lidar.point_index, :3].astype(np.float64)
+        target = job.view.project(points @ T[:3, :3].T + T[:3, 3])
+        full = np.zeros((2, *network_size(*lidar.shape)), np.float32)
+        full[:, lidar.cells[:, 0], lidar.cells[:, 1]] = (target - lidar.pixels_px).T
+        coarse = np.stack([np.zeros_like(full[0]), np.ones_like(full[0])])[:, ::8, ::8]
+        return to_table(job, lidar, full, coarse, cell=8)
 
     monkeypatch.setattr(FlowMatcher, "match", match)
 
@@ -124,15 +120,3 @@ def test_frames_beyond_the_range_of_training_are_dropped(
     assert failed["front_left"] == [] and len(failed["left"]) == 2
     assert result.camera_verdicts["left"].status == "FAIL"
     assert any("100% of the frames failed" in r for r in result.camera_verdicts["left"].reasons)
-
-
-@pytest.mark.slow
-def test_a_batch_gives_what_single_images_give(sample: Dataset, weights: Path) -> None:
-    one, four = (
-        CmrNextMatcher([weights], batch=size, iterations=1).match(
-            sample.select("0:1"), sample.rig, round_index=0, progress=lambda *_: None
-        )
-        for size in (1, 4)
-    )
-    assert len(one) == len(four)
-    np.testing.assert_allclose(one.pixels_px, four.pixels_px, atol=1e-3)

@@ -32,7 +32,7 @@ from calibgraph.progress import no_progress
 from tests.matching.structure.data import never
 
 NAMES = ("front_left", "front_right")
-MANY, AGAIN = (least_z_score(TRIES[searches]) for searches in (1, 2))
+MANY = least_z_score(TRIES[1])
 ALONE = least_z_score(global_search.ALONE)
 
 
@@ -293,10 +293,6 @@ def test_in_few_frames_the_fine_levels_can_accept_a_pose(
         assert found.chance is None
     if accepted:
         np.testing.assert_allclose(found.camera.T_camera_lidar, off(elsewhere, 0.1), atol=1e-9)
-
-
-def test_fewer_tries_need_less() -> None:
-    assert ALONE < MANY < AGAIN < math.inf
 
 
 @pytest.mark.parametrize("chance", [acceptance.SEARCH, second_look_chance(12.0)])

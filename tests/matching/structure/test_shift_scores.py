@@ -52,17 +52,6 @@ def test_an_image_is_scaled_once_for_each_size(monkeypatch: pytest.MonkeyPatch) 
     assert image.padded_log_gray(camera, 0.02, 1.0)[0] is not kept
 
 
-@pytest.mark.parametrize("step_rad", [0.0021, 0.0037, 0.0101, 0.03])
-def test_an_image_is_reduced_to_the_bits_of_opencv(step_rad: float) -> None:
-    data = calibgraph.load_dataset(SAMPLE)
-    camera = data.rig.cameras["left"]
-    gray = data.frames[0].load_gray("left", camera)
-    small, _ = PreparedImage(gray).log_gray(camera, step_rad, 1.0)
-    values = cv2.LUT(gray, np.log1p(np.arange(256, dtype=np.float32)))
-    expected = cv2.resize(values, small.shape[::-1], interpolation=cv2.INTER_AREA)
-    np.testing.assert_array_equal(small, cv2.GaussianBlur(expected, (0, 0), 1.0))
-
-
 def test_images_finer_than_the_finest_level_needs_are_reduced() -> None:
     """By whole pixels, which moves nothing; their logarithm changes by the rounding of gray."""
     camera = calibgraph.load_dataset(SAMPLE).rig.cameras["left"]
