@@ -112,15 +112,20 @@ def motion_by_poses(trajectory: Trajectory, frame: Frame, to_s: float) -> ScanMo
 def _by_scans(frames: Sequence[Frame], frame: Frame, to_s: float) -> ScanMotion:
     """The mean velocity from the scan before to this one, and to the one after."""
     place = next(k for k, other in enumerate(frames) if other.index == frame.index)
-    beside = [*frames[max(place - 1, 0) : place], *frames[place + 1 : place + 2]]
-    later_s = [(other, seconds_between(frame, other) or 0.0) for other in beside]
-    near = [(other, s) for other, s in later_s if 0 < abs(s) < _NEIGHBOUR_S]
+    near = scans_beside(frames, place)
     if not near:
         raise DatasetError(
             f"{frame.cloud_path}: has no scan within {_NEIGHBOUR_S} s before or after it, from "
             "which its motion could be found; choose other frames, or --motion odometry or tf"
         )
     return ScanMotion(tuple(twist_by_scans(frame, near).tolist()), to_s)
+
+
+def scans_beside(frames: Sequence[Frame], place: int) -> list[tuple[Frame, float]]:
+    """The frames before and after one whose scans are near in time, and how much later [s]."""
+    beside = [*frames[max(place - 1, 0) : place], *frames[place + 1 : place + 2]]
+    later_s = [(other, seconds_between(frames[place], other) or 0.0) for other in beside]
+    return [(other, s) for other, s in later_s if 0 < abs(s) < _NEIGHBOUR_S]
 
 
 def _odometry(bag: Bag, lidar: str, options: BagOptions) -> Iterator[tuple[int, Array]]:

@@ -30,7 +30,7 @@ from calibgraph.io.clouds import (
 )
 from calibgraph.io.dataset_folders import folder_layout, frames_of_folder, published_folder
 from calibgraph.io.frame import Frame, Kept, ScanMotion, twist_by_scans
-from calibgraph.io.frame_files import way_out
+from calibgraph.io.frame_files import stated_stamps, way_out
 from calibgraph.io.rigs import describe_rig, read_rig
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.parallel import KeyedCache
@@ -197,8 +197,15 @@ def _frames_of_files(
     found, pairing = frames_of_folder(
         path, [*rig.cameras], lidars=rig.all_lidars, complete=complete, sync_tolerance_s=tolerance_s
     )
+    stamps_ns = stated_stamps(path, len(found)) if rig.other_lidars else [None] * len(found)
     frames = tuple(
-        replace(each, index=start + n, name=prefix + each.name, columns=rig.cloud_columns)
+        replace(
+            each,
+            index=start + n,
+            name=prefix + each.name,
+            recorded_ns=stamps_ns[n],
+            columns=rig.cloud_columns,
+        )
         for n, each in enumerate(found)
         if not pairing or rig.cameras.keys() <= each.image_paths.keys()
     )

@@ -131,6 +131,7 @@ class Frame:
         twist: (6,) of the LiDAR, in place of one that is computed.
         lidar_paths: the clouds of other LiDARs of this instant, by name.
         burnt_in: per camera, what its images are filled at when they are loaded.
+        recorded_ns: its stamp, where its name is none.
         images_after_s: per camera, by how much its image is after the stamp, where no names of
             files state it.
         columns: names of those of a .bin cloud, if the rig states them.
@@ -150,6 +151,7 @@ class Frame:
     twist: Array | None = field(default=None, kw_only=True, compare=False)
     lidar_paths: Mapping[str, Path] = field(default_factory=dict, kw_only=True)
     burnt_in: Mapping[str, BurntIn] = field(default_factory=dict, kw_only=True, compare=False)
+    recorded_ns: int | None = field(default=None, kw_only=True)
     images_after_s: Mapping[str, float] = field(default_factory=dict, kw_only=True, compare=False)
     columns: tuple[str, ...] | None = field(default=None, kw_only=True)
     arrays: Mapping[Path, NDArray[Any]] = field(
@@ -173,7 +175,9 @@ class Frame:
 
     @property
     def stamp_ns(self) -> int | None:
-        """The stamp that names it; None if another name does."""
+        """The stamp that names it, or that is stated beside it; None without."""
+        if self.recorded_ns is not None:
+            return self.recorded_ns
         stem = self.name.rpartition("/")[2]
         return int(stem) if self.cloud_path.suffix == MESSAGE_SUFFIX else stamp_ns_in_name(stem)
 
@@ -300,6 +304,8 @@ class Frame:
             "cloud": str(self.cloud_path),
             "images": {name: str(path) for name, path in self.image_paths.items()},
         }
+        if self.lidar_paths:
+            files["lidars"] = {name: str(path) for name, path in self.lidar_paths.items()}
         if self.columns is not None:
             files[_COLUMNS] = list(self.columns)
         motion = self.motion
@@ -382,12 +388,13 @@ def seconds_between(one: Frame, other: Frame) -> float | None:
 def frame_of_entry(entry: Mapping[str, Any]) -> Frame:
     """The frame that a result's entry names, its cloud corrected as it was."""
     images = {name: Path(path) for name, path in entry["images"].items()}
+    lidars = {name: Path(path) for name, path in entry.get("lidars", {}).items()}
     files = entry["frame"], entry["name"], Path(entry["cloud"]), images
     motion, columns = entry.get(_MOTION), entry.get(_COLUMNS)
     if motion is None:
-        return Frame(*files, columns=columns)
+        return Frame(*files, lidar_paths=lidars, columns=columns)
     found = ScanMotion(tuple(motion["twist_per_s"]), motion["to_s"])
-    return Frame(*files, find_motion=lambda: found, columns=columns)
+    return Frame(*files, find_motion=lambda: found, lidar_paths=lidars, columns=columns)
 
 
 def hash_source(path: Path) -> str:

@@ -7,7 +7,7 @@ from pathlib import Path
 from shlex import quote
 
 from calibgraph.errors import FileError
-from calibgraph.files import is_utf8, require_file
+from calibgraph.files import is_utf8, read_text, require_file
 
 _PCD = ".pcd"  # NAME.pcd.bin is a cloud of nuScenes
 _UNPACK = {".gz": "gunzip", ".bz2": "bunzip2", ".xz": "unxz", ".lz4": "unlz4", ".zst": "unzstd",
@@ -67,6 +67,28 @@ def stamp_ns_in_name(name: str) -> int | None:
     if whole := found[0]["whole"]:
         return int(whole) * _NS_BY_DIGITS[len(whole)]
     return int(found[0]["s"]) * _NS_BY_DIGITS[10] + int(found[0]["part"].ljust(9, "0"))
+
+
+def stated_stamps(folder: Path, count: int) -> Sequence[int | None]:
+    """The stamps [ns] of so many clouds in times.txt, a line each; None without that file.
+
+    A line is a number of seconds, or a time as :func:`stamp_ns_in_name` reads it.
+    """
+    path = folder / "times.txt"
+    if not path.is_file():
+        return [None] * count
+    lines = read_text(path).split()
+    if len(lines) != count:
+        raise FileError(path, f"has {len(lines)} stamps for {count} clouds; write one a line")
+    return [_stated_ns(path, line) for line in lines]
+
+
+def _stated_ns(path: Path, line: str) -> int:
+    stamp_ns = stamp_ns_in_name(line) if line.isdecimal() else None
+    try:
+        return round(Decimal(line) * 10**9) if stamp_ns is None else stamp_ns
+    except (ArithmeticError, ValueError):  # no number, or NaN
+        raise FileError(path, f"{line[:50]!r} is no time in seconds") from None
 
 
 def files_by_stem(folder: Path, suffixes: Sequence[str]) -> dict[str, Path]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 
 import cv2
 import numpy as np
@@ -18,6 +19,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from calibgraph.arrays import Array
+from calibgraph.errors import CalibrationError
 from calibgraph.model.geometry import invert, transform
 
 LEAST_OVERLAP = 0.5
@@ -60,6 +62,8 @@ tried."""
 _GROUND_M, _BELOW_M, _SENSOR_M = 0.1, 0.3, (0.2, 5.0)  # of a plane, below it, of the LiDAR above it
 _GROUND_REACH_M, _MOST_BELOW = 15.0, 0.03
 _TRIPLES, _GROUND_POINTS = 1000, 2000
+_LOWEST = 0.3  # of the points on the plane that holds most; planes that are neither have up to 0.15
+_UPS = np.array([up for up in product((-1.0, 0.0, 1.0), repeat=3) if any(up)])
 
 
 def find_up(cloud: NDArray[np.floating], cameras: Iterable[Array]) -> Array | None:
@@ -117,6 +121,28 @@ def find_ground(cloud: NDArray[np.floating], up: Array) -> tuple[float, float, A
         return 0.0, 0.0, up
     best = int(on_it.argmax())
     return float(on_it[best]), float(height_m[possible][best]), normal[possible][best]
+
+
+def find_upright(name: str, clouds: Sequence[Array]) -> Array:
+    """(4, 4) T_up_lidar: z up, 0 on the ground; by all instants together.
+
+    In a narrow street a wall may hold more points than the ground, but the ground is nearer.
+    """
+    cloud = np.concatenate(clouds)
+    grounds = [find_ground(cloud, up / np.linalg.norm(up)) for up in _UPS]
+    most = max(share for share, _, _ in grounds)
+    _, height_m, normal = min(
+        (ground for ground in grounds if ground[0] >= _LOWEST * most), key=lambda ground: ground[1]
+    )
+    if most == 0.0:
+        raise CalibrationError(
+            f"LiDAR {name!r} sees no ground, by which its placement is found; write its "
+            "T_base_lidar into rig.yaml"
+        )
+    T = np.eye(4)
+    T[:3, :3] = Rotation.align_vectors([[0.0, 0.0, 1.0]], normal[None])[0].as_matrix()
+    T[2, 3] = height_m
+    return T
 
 
 @dataclass(frozen=True, eq=False)

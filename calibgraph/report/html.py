@@ -28,6 +28,7 @@ from calibgraph.model.result_files import (
 )
 from calibgraph.model.verdict import Check, Direction, beside, in_unit, is_reachable
 from calibgraph.report.kit import page_template
+from calibgraph.report.lidar_views import draw_lidars
 from calibgraph.report.page_overlays import (
     depth_scale,
     draw_overlays,
@@ -77,11 +78,14 @@ def render_page(result: Calibration) -> str:
         for index, (name, camera) in enumerate(rig.cameras.items())
     ]
     lidars = [_lidar_row(result, name) for name in result.lidar_verdicts]
+    views, views_left_out = draw_lidars(result) if lidars else (None, "")
     summary = result.summary
     return page_template("calibgraph.report").render(
         result=result,
         cameras=cameras,
         lidars=lidars,
+        views=views,
+        views_left_out=views_left_out,
         summary=summary,
         recording=recording_name(result),
         places=describe_places(result.places) if result.places else "",

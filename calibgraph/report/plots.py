@@ -52,8 +52,13 @@ def residual_map(camera: Camera, errors: ReprojectionErrors) -> tuple[str, float
     for start, end in np.rint(2**_SUBPIXEL_BITS * np.stack([starts, ends], axis=1)).astype(int):
         cv2.arrowedLine(image, start, end, _ARROW, 2, cv2.LINE_AA, _SUBPIXEL_BITS, 0.3)
     cv2.rectangle(image, (0, 0), (_WIDTH_PX - 1, height - 1), _FRAME)
+    return png_uri(image), factor
+
+
+def png_uri(image: NDArray[np.uint8]) -> str:
+    """A picture, BGR, as a PNG in a data URI."""
     _, data = cv2.imencode(".png", image)
-    return f"data:image/png;base64,{base64.b64encode(data.tobytes()).decode('ascii')}", factor
+    return f"data:image/png;base64,{base64.b64encode(data.tobytes()).decode('ascii')}"
 
 
 def _thin(dots: Array) -> Array:
@@ -165,7 +170,7 @@ def _errors_at(T_camera_lidar: Array, matches: CameraBlock, gate_px: float) -> R
 
 
 def constrained(residuals: Array, information: Array | None) -> Array:
-    """(n, 2) I^(1/2) r / lambda_max^(1/2); its length is ``whitening.constrained_error_px``.
+    """(n, 2) I^(1/2) r / lambda_max^(1/2); its length is the constrained error.
 
     The root of a 2x2 matrix I is (I + sqrt(det I) E) / sqrt(tr I + 2 sqrt(det I)).
     """

@@ -16,9 +16,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calibgraph.arrays import Array
+from calibgraph.matching.cloud_similarity import find_upright
 from calibgraph.model.geometry import transform
 from calibgraph.model.rig import VEHICLE_AXES, Vehicle
-from calibgraph.vehicle.start import find_upright
 from calibgraph.vehicle.travel import Travel
 
 _REACH_M, _GATES_M = 12.0, (0.3, 0.15, 0.08)  # of the ground that counts; of its fits, in turn

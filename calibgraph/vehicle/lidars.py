@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError
-from calibgraph.vehicle.planes import Planes, find_planes
+from calibgraph.vehicle.planes import Planes, Views
 from calibgraph.vehicle.sums import Matches, Sums, sum_up
 
 _GATES_M = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18, 0.13)  # of the residuals, while the poses converge
@@ -48,9 +48,6 @@ GUESS_SIGMAS = np.repeat([np.radians(10.0), 1.0], 3)
 """(6,) [rad, m] of a direction that no plane determines."""
 _EXACT = 1e-18  # [m^2, rad^2] least variance, for rounding
 _SETTLED, _MOST_STEPS = 0.01, 50  # of REML
-
-Clouds = Mapping[str, Sequence[Array]]
-"""Per LiDAR its clouds (n, 3+) in its own frame [m], one of each instant; the same instants."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,30 +75,34 @@ class LidarPoses:
     place_ratios: tuple[float, float]
 
 
-def calibrate_lidars(clouds: Clouds, T_base_lidar: Mapping[str, Array], *, base: str) -> LidarPoses:
+def calibrate_lidars(
+    views: Views, T_base_lidar: Mapping[str, Array], *, base: str,
+    place_sigmas: Array = PLACE_SIGMAS,
+) -> LidarPoses:  # fmt: skip
     """The poses of LiDARs from what they see in common, at all instants at once.
 
     The vehicle stands at each instant, or the clouds have been brought to one time. Of instants
     between which it has not moved the first is taken: their errors are the same.
 
     Args:
-        clouds: of at least two LiDARs, the base among them.
+        views: of at least two LiDARs, the base among them.
         T_base_lidar: (4, 4) the guess of each but the base, within some 5 degrees and half a metre.
         base: name of the LiDAR in whose frame the others are.
+        place_sigmas: (6,) prior of what a pose differs between places.
 
     Raises:
         CalibrationError: if LiDARs see too little in common.
-        ValueError: if names or counts of clouds do not fit.
+        ValueError: if names or counts of views do not fit.
     """
-    names = [base, *(name for name in clouds if name != base)]
-    _require_alike(clouds, T_base_lidar, names)
-    planes = [[find_planes(cloud) for cloud in clouds[name]] for name in names]
+    names = [base, *(name for name in views if name != base)]
+    _require_alike(views, T_base_lidar, names)
+    planes = [[view.planes for view in views[name]] for name in names]
     kept = _distinct(planes[0])
     planes = [[of[i] for i in kept] for of in planes]
     T = np.array([np.eye(4), *(np.asarray(T_base_lidar[name], np.float64) for name in names[1:])])
     T, _ = refine_poses(planes, T, names)
     places = [_at_place([of[i : i + 1] for of in planes], T, names) for i in range(len(planes[0]))]
-    step, joint, ratios = combine_places(places)
+    step, joint, ratios = combine_places(places, place_sigmas)
     T = _moved(T, step)
     near, on = count_matched(planes, T)
     rows = [slice(6 * row, 6 * row + 6) for row in range(len(names) - 1)]
@@ -113,6 +114,26 @@ def calibrate_lidars(clouds: Clouds, T_base_lidar: Mapping[str, Array], *, base:
         dict(zip(names, (on / near).tolist(), strict=True)),
         len(places),
         ratios,
+    )
+
+
+def join_poses(parts: Sequence[LidarPoses], names: Sequence[str]) -> LidarPoses:
+    """Poses that were found independently of each other, in the order of names, the base first."""
+    covariance = {name: own for part in parts for name, own in part.covariance.items()}
+    rows = [6 * names.index(name) - 6 + axis for name in covariance for axis in range(6)]
+    joint = np.zeros((len(rows), len(rows)))
+    joint[np.ix_(rows, rows)] = scipy.linalg.block_diag(*(part.joint_covariance for part in parts))
+    return LidarPoses(
+        names[0],
+        {
+            name: next(p.T_base_lidar[name] for p in parts if name in p.T_base_lidar)
+            for name in names
+        },
+        {name: covariance[name] for name in names[1:]},
+        joint,
+        {name: min(p.matched[name] for p in parts if name in p.matched) for name in names},
+        min(part.places for part in parts),
+        (max(p.place_ratios[0] for p in parts), max(p.place_ratios[1] for p in parts)),
     )
 
 
@@ -157,12 +178,12 @@ def _distinct(planes: Sequence[Planes]) -> list[int]:
     return kept
 
 
-def _require_alike(clouds: Clouds, guess: Mapping[str, Array], names: Sequence[str]) -> None:
-    if names[0] not in clouds or len(names) == 1:
-        raise ValueError(f"clouds of {', '.join(clouds)}: of the base {names[0]} and another")
+def _require_alike(views: Views, guess: Mapping[str, Array], names: Sequence[str]) -> None:
+    if names[0] not in views or len(names) == 1:
+        raise ValueError(f"clouds of {', '.join(views)}: of the base {names[0]} and another")
     if missing := [name for name in names[1:] if name not in guess]:
         raise ValueError(f"T_base_lidar has no guess of {', '.join(missing)}")
-    counts = {name: len(clouds[name]) for name in names}
+    counts = {name: len(views[name]) for name in names}
     if len({*counts.values()}) > 1:
         raise ValueError(f"clouds of the same instants are needed; found {counts}")
 
@@ -301,13 +322,13 @@ def _steps_between(T_base_lidar: Array, others: Array) -> Array:
 
 
 def combine_places(
-    places: Sequence[tuple[Array, Array]],
+    places: Sequence[tuple[Array, Array]], place_sigmas: Array = PLACE_SIGMAS
 ) -> tuple[Array, Array, tuple[float, float]]:
     """(d,) step to the optimum over places, its (d, d) covariance, and the ratios of D."""
     informations, vectors = map(np.array, zip(*places, strict=True))
     size = len(vectors[0])
     is_turn = np.tile([True] * 3 + [False] * 3, size // 6)
-    prior = np.tile(PLACE_SIGMAS**2, size // 6)
+    prior = np.tile(place_sigmas**2, size // 6)
     guess = np.tile(GUESS_SIGMAS**-2.0, size // 6)
     ratios = np.ones(2)
     for _ in range(_MOST_STEPS):

@@ -7,9 +7,9 @@ were measured, if they spread in two directions.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,6 +52,10 @@ class Planes:
             self.centers_m[rows], self.normals[rows], self.radii_m[rows], self.tilts[rows]
         )
 
+    def thinned(self, most: int) -> Planes:
+        """At most so many of them."""
+        return self.select(np.arange(0, len(self), max(-(-len(self) // most), 1)))
+
     def moved(self, T_base_lidar: Array) -> Planes:
         """The same in another frame, by (4, 4)."""
         R = T_base_lidar[:3, :3]
@@ -60,6 +64,25 @@ class Planes:
 
 
 _NONE = Planes(np.empty((0, 3)), np.empty((0, 3)), np.empty(0), np.empty(0))
+
+
+class View(NamedTuple):
+    """What a LiDAR sees at one instant: (n, 3) points [m], and their planes, in its frame."""
+
+    points_m: Array
+    planes: Planes
+
+
+Views = Mapping[str, Sequence[View]]
+"""Per LiDAR, one of each instant; the same instants."""
+
+
+def look(clouds: Mapping[str, Sequence[Array]]) -> Views:
+    """The views of clouds, (n, 3) or more columns [m]."""
+    return {
+        name: [View(cloud[:, :3].astype(np.float64), find_planes(cloud)) for cloud in of]
+        for name, of in clouds.items()
+    }
 
 
 def find_planes(points_lidar_m: Array) -> Planes:

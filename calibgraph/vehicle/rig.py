@@ -8,27 +8,43 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError, DatasetError
 from calibgraph.io.clouds import TIMES
 from calibgraph.io.dataset import Dataset, spread_out
 from calibgraph.io.frame import Frame
+from calibgraph.matching.cloud_similarity import find_upright
 from calibgraph.model.config import Config
+from calibgraph.model.geometry import transform
 from calibgraph.model.rig import Lidar, Rig, Vehicle
 from calibgraph.model.verdict import ABOUT_THE_DATA, Check, Verdict
 from calibgraph.progress import Progress
 from calibgraph.trust.probability import TABLES, judge, probability_beyond
 from calibgraph.trust.thresholds import threshold
 from calibgraph.vehicle.frame import Road, find_road, find_vehicle
-from calibgraph.vehicle.lidars import GUESS_SIGMAS, LidarPoses, calibrate_lidars
-from calibgraph.vehicle.motion import Instant, read_instants
+from calibgraph.vehicle.lidars import (
+    GUESS_SIGMAS,
+    PLACE_SIGMAS,
+    LidarPoses,
+    calibrate_lidars,
+    join_poses,
+)
+from calibgraph.vehicle.motion import REACH_M, Drive, Instant
+from calibgraph.vehicle.planes import View, Views, look
 from calibgraph.vehicle.start import locate_lidars
 from calibgraph.vehicle.travel import POSE_FILES, Travel, direction_of_travel, read_poses
 
 MOST_INSTANTS = 20
 """Of a recording, spread over it: more hardly narrow what places differ by."""
 
+MAP_SIGMAS = np.repeat([np.radians(0.1), 0.03], 3)
+"""(6,) [rad, m]: prior of what the motion within a local map adds to a pose, as PLACE_SIGMAS."""
+_HOW_TO_JOIN = (
+    "or drive 150 m past walls, with times of points, and stamps in the names of clouds or in "
+    "times.txt, so that LiDARs are joined by motion"
+)
 _ROUNDS = 2  # while it moves: clouds are brought to one time by the poses found
 _LOOSE = 0.3  # sigma of an axis over that of the guess: planes hardly determine it
 _OPEN = 0.98  # probability of an error by a bar alone: what is open is not known to be wrong
@@ -80,24 +96,22 @@ def calibrate_rig_lidars(
         warnings.append(f"{left} of {len(dataset.frames)} instants lack a cloud and are left out")
     names, path = (rig.lidar, *rig.other_lidars), _pose_file(dataset)
     progress("reading clouds of LiDARs", 0, 1)
-    instants, lines = _usable(read_instants(spread_out(frames, MOST_INSTANTS), names, path))
+    drive = Drive(frames, path)
+    every = spread_out(range(len(frames)), MOST_INSTANTS)
+    instants, lines = _usable([drive.instant(number, names) for number in every])
     warnings += lines
     guess = {name: rig.T_base_lidar.get(name) for name in rig.other_lidars}
-    known = {name: T for name, T in guess.items() if T is not None}
-    clouds = _at_stamps(instants, {rig.lidar: np.eye(4), **guess})
     progress("locating LiDARs", 0, 1)
-    try:
-        start, doubts = locate_lidars(clouds, guess, base=rig.lidar)
-    except CalibrationError as error:
-        if len(known) < len(guess):
-            raise
-        warnings.append(f"{error}; begun from the guess")
-        start, doubts = known, {}
-    for number in range(_ROUNDS if any(each.twist_per_s is not None for each in instants) else 1):
-        progress("calibrating LiDARs", number, _ROUNDS)
-        clouds = _at_stamps(instants, {rig.lidar: np.eye(4), **start})
-        poses = calibrate_lidars(clouds, start, base=rig.lidar)
-        start = dict(poses.T_base_lidar)
+    views = _look(instants, guess, rig.lidar)
+    start, doubts, lost = locate_lidars(views, guess, base=rig.lidar)
+    parts = [_solve(instants, views, start, base=rig.lidar)] if start else []
+    if lost:
+        progress("joining LiDARs by motion", 0, 1)
+        far = {name: T for name, T in guess.items() if name not in start}
+        poses, more, line = _join_by_motion(drive, instants, far, lost, base=rig.lidar)
+        parts, doubts, warnings = [*parts, poses], doubts | more, [*warnings, line]
+    poses = join_poses(parts, [rig.lidar, *guess])
+    clouds = _at_stamps(instants, poses.T_base_lidar)
     lidars = {rig.lidar: Lidar()} | {
         name: Lidar(T_base_lidar=poses.T_base_lidar[name], covariance=poses.covariance[name])
         for name in rig.other_lidars
@@ -119,6 +133,82 @@ def calibrate_rig_lidars(
         },
         tuple(warnings),
     )
+
+
+def _look(
+    instants: Sequence[Instant], T_base_lidar: Mapping[str, Array | None], base: str
+) -> Views:
+    return look(_at_stamps(instants, {base: np.eye(4), **T_base_lidar}))
+
+
+def _solve(
+    instants: Sequence[Instant], views: Views, start: Mapping[str, Array], *, base: str,
+    maps: Sequence[View] = (),
+) -> LidarPoses:  # fmt: skip
+    """The poses of LiDARs from a start, against local maps of the base if there are any."""
+    moves, sigmas = any(each.twist_per_s is not None for each in instants), PLACE_SIGMAS
+    for _ in range(_ROUNDS if moves else 1):
+        if moves:
+            views = _look(instants, start, base)
+        seen = {base: maps or views[base], **{name: views[name] for name in start}}
+        sigmas = MAP_SIGMAS if maps else PLACE_SIGMAS
+        poses = calibrate_lidars(seen, start, base=base, place_sigmas=sigmas)
+        start = {name: T for name, T in poses.T_base_lidar.items() if name != base}
+    return poses
+
+
+def _join_by_motion(
+    drive: Drive, instants: Sequence[Instant], guess: Mapping[str, Array | None], lost: str, *,
+    base: str,
+) -> tuple[LidarPoses, dict[str, str], str]:  # fmt: skip
+    """The poses of LiDARs that share too little at one time, doubts of them, and a line.
+
+    They are calibrated to what the base sees before and after.
+    """
+    maps, at, after = list[View](), list[Instant](), -1
+    for instant in instants:
+        if instant.frame > after and (found := drive.local_map(instant.frame, base)) is not None:
+            after = found[1]
+            maps, at = [*maps, found[0]], [*at, instant]
+    known = {name: T for name, T in guess.items() if T is not None}
+    if not maps:
+        if len(known) < len(guess):
+            raise CalibrationError(f"{lost}; {_HOW_TO_JOIN}")
+        views = _look(instants, known, base)
+        return _solve(instants, views, known, base=base), {}, f"{lost}; begun from the guess"
+    turned = {name: T for name in guess if name not in known
+              and (T := _turn_by_motion(drive, at, name, maps)) is not None}  # fmt: skip
+    near = {**guess, **turned}
+    views = {**_look(at, near, base), base: maps}
+    start, doubts, lost = locate_lidars(views, near, base=base, turned=turned)
+    if lost:
+        raise CalibrationError(f"by motion, with what {base} sees {REACH_M:g} m before and after, "
+                               f"too: {lost}")  # fmt: skip
+    line = (f"{', '.join(guess)} and {base} share too little at one time: joined by motion, at "
+            f"{len(maps)} places of what {base} sees {REACH_M:g} m before and after")  # fmt: skip
+    return _solve(at, views, start, base=base, maps=maps), doubts, line
+
+
+def _turn_by_motion(
+    drive: Drive, instants: Sequence[Instant], lidar: str, maps: Sequence[View]
+) -> Array | None:
+    """(4, 4) the rotation by which both LiDARs move alike, and have the ground below (hand-eye).
+
+    None where the LiDAR's own motion is unknown.
+    """
+    own, moving = drive.of(lidar), [each for each in instants if each.twist_per_s is not None]
+    found = [(each.twist_per_s[3:], own.twist(each.frame)[3:]) for each in moving
+             if each.twist_per_s is not None]  # fmt: skip
+    velocities = [(v, w) for v, w in found if np.any(w)]
+    if not velocities:
+        return None
+    ups = [find_upright(name, clouds)[2, :3] for name, clouds in (
+        ("base", [view.points_m for view in maps]), (lidar, [of.clouds[lidar] for of in instants])
+    )]  # fmt: skip
+    speed_m_s = max(float(np.linalg.norm(v)) for v, _ in velocities)
+    pairs = [*velocities, *[(speed_m_s * ups[0], speed_m_s * ups[1])] * len(velocities)]
+    rotation, _ = Rotation.align_vectors(*map(np.array, zip(*pairs, strict=True)))
+    return transform(rotation.as_matrix())
 
 
 def _road(clouds: Mapping[str, Sequence[Array]], poses: LidarPoses) -> Road | None:

@@ -9,8 +9,7 @@ that.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from itertools import product
+from collections.abc import Collection, Mapping, Sequence
 from typing import NamedTuple
 
 import cv2
@@ -19,10 +18,10 @@ from scipy.spatial.transform import Rotation
 
 from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError
-from calibgraph.matching.cloud_similarity import find_ground
+from calibgraph.matching.cloud_similarity import find_upright
 from calibgraph.model.geometry import invert
-from calibgraph.vehicle.lidars import Clouds, count_matched, refine_poses
-from calibgraph.vehicle.planes import Planes, find_planes, join_planes
+from calibgraph.vehicle.lidars import count_matched, refine_poses
+from calibgraph.vehicle.planes import Planes, View, Views, join_planes
 
 _CELLS, _CELL_M = 192, 0.5  # of an image from above
 _FROM_M, _TO_M = 0.4, 6.0  # over the ground: what is upright
@@ -30,6 +29,7 @@ _STEP_DEG = 3.0  # between headings
 _APART_M = 12.0  # of two LiDARs of one vehicle
 _NEAR_DEG, _NEAR_M = 35.0, 2.5  # of a guess
 _TRIED, _PER_HEADING = 8, 3  # placements that are refined; of them with a similar heading
+_TRIED_ALONG = 24  # where the heading alone is known: along a street, all shifts look alike
 _INSTANTS = 3  # that are looked at
 _LEAST_ON, _LEAST_SHARE = 15, 0.7
 """Upright planes that lie on another's, and their share of those near one. Of two vehicles (carla,
@@ -40,8 +40,6 @@ _PEAK_DEG, _PEAK_M, _BAND_DEG = 10.0, 1.5, 15.0  # about one that has been tried
 _POWER = 4  # of the share in a score: where poses are right, a plane off another's is rare
 _AS_GOOD = 0.85  # of the best score
 _OTHER_DEG, _OTHER_M = 5.0, 0.5  # from which a placement is another one
-_GROUND = 0.3  # of the points on the plane that holds most; planes that are neither have up to 0.15
-_UPS = np.array([up for up in product((-1.0, 0.0, 1.0), repeat=3) if any(up)])
 
 
 class _Seen(NamedTuple):
@@ -68,44 +66,61 @@ class _Placement(NamedTuple):
         return self.on * self.share**_POWER
 
 
+class _Near(NamedTuple):
+    """(4, 4) near whose rotation, and near whose position placements are sought; None: any."""
+
+    turn: Array | None
+    place: Array | None
+
+
 _Placed = Mapping[str, tuple[_Seen, Array]]
 """LiDARs whose (4, 4) T_base_lidar is known."""
 
 
 def locate_lidars(
-    clouds: Clouds, guess: Mapping[str, Array | None], *, base: str
-) -> tuple[dict[str, Array], dict[str, str]]:
-    """Rough (4, 4) T_base_lidar of each LiDAR but the base; a line on each that fits twice.
+    views: Views,
+    guess: Mapping[str, Array | None],
+    *,
+    base: str,
+    turned: Collection[str] = (),
+) -> tuple[dict[str, Array], dict[str, str], str]:
+    """Rough (4, 4) T_base_lidar of LiDARs but the base; a line on each that fits twice.
+
+    And why the others, which share too little with those, are not placed; empty if there are none.
 
     Args:
-        clouds: as of :func:`calibgraph.vehicle.lidars.calibrate_lidars`.
+        views: as of :func:`calibgraph.vehicle.lidars.calibrate_lidars`.
         guess: per LiDAR but the base (4, 4), within some 30 degrees and 2 metres; None if unknown.
         base: whose frame it is.
+        turned: names of those of whose guess the rotation alone is known.
 
     Raises:
-        CalibrationError: if a LiDAR has no ground, or shares too little with those that are placed.
+        CalibrationError: if a LiDAR sees no ground.
     """
-    chosen = np.unique(np.linspace(0, len(clouds[base]) - 1, _INSTANTS).round().astype(int))
-    seen = {name: _look(name, [of[i] for i in chosen]) for name, of in clouds.items()}
-    placed, left = {base: (seen[base], np.eye(4))}, [name for name in clouds if name != base]
-    doubts = dict[str, str]()
-    while left:
+    chosen = np.unique(np.linspace(0, len(views[base]) - 1, _INSTANTS).round().astype(int))
+    seen = {name: _look(name, [of[i] for i in chosen]) for name, of in views.items()}
+    placed, left = {base: (seen[base], np.eye(4))}, [name for name in views if name != base]
+    doubts, lost = dict[str, str](), ""
+    while left and not lost:
         found = {}
         for name in left:
-            tried = _placements(seen[name], placed, seen[base].T_up_lidar, guess[name])
-            found[name], doubts[name] = _best(tried, guess[name])
-        _require_one(found, [*placed])
+            place = None if name in turned else guess[name]
+            near = _Near(guess[name], place)
+            tried = _placements(seen[name], placed, seen[base].T_up_lidar, near)
+            found[name], doubts[name] = _best(tried, place)
+        lost = _why_lost(found, [*placed])
         placed |= {name: (seen[name], of.T) for name, of in found.items() if of.is_sure}
         left = [name for name in left if name not in placed]
     poses = {name: T for name, (_, T) in placed.items() if name != base}
-    return poses, {name: doubts[name] for name in poses if doubts[name]}
+    return poses, {name: doubts[name] for name in poses if doubts[name]}, lost
 
 
-def _require_one(found: Mapping[str, _Placement], placed: Sequence[str]) -> None:
+def _why_lost(found: Mapping[str, _Placement], placed: Sequence[str]) -> str:
+    """Empty if one is sure."""
     if any(each.is_sure for each in found.values()):
-        return
+        return ""
     name = max(found, key=lambda each: found[each].on)
-    raise CalibrationError(
+    return (
         f"LiDAR {name!r} shares too little with {', '.join(placed)}: {found[name].on} upright "
         f"planes lie on theirs, {found[name].share:.0%} of those near one; at least {_LEAST_ON} "
         f"and {_LEAST_SHARE:.0%} are needed: record where walls, poles or cars are in view of "
@@ -113,38 +128,13 @@ def _require_one(found: Mapping[str, _Placement], placed: Sequence[str]) -> None
     )
 
 
-def _look(name: str, clouds: Sequence[Array]) -> _Seen:
-    points = [np.asarray(cloud[:, :3], np.float64) for cloud in clouds]
-    planes = [find_planes(cloud) for cloud in points]
-    some = [of.select(np.arange(0, len(of), max(-(-len(of) // _MOST_PLANES), 1))) for of in planes]
+def _look(name: str, views: Sequence[View]) -> _Seen:
+    points = [view.points_m for view in views]
+    some = [view.planes.thinned(_MOST_PLANES) for view in views]
     return _Seen(points, some, find_upright(name, points))
 
 
-def find_upright(name: str, clouds: Sequence[Array]) -> Array:
-    """(4, 4) T_up_lidar: z up, 0 on the ground; by all instants together.
-
-    In a narrow street a wall may hold more points than the ground, but the ground is nearer.
-    """
-    cloud = np.concatenate(clouds)
-    grounds = [find_ground(cloud, up / np.linalg.norm(up)) for up in _UPS]
-    most = max(share for share, _, _ in grounds)
-    _, height_m, normal = min(
-        (ground for ground in grounds if ground[0] >= _GROUND * most), key=lambda ground: ground[1]
-    )
-    if most == 0.0:
-        raise CalibrationError(
-            f"LiDAR {name!r} sees no ground, by which its placement is found; write its "
-            "T_base_lidar into rig.yaml"
-        )
-    T = np.eye(4)
-    T[:3, :3] = Rotation.align_vectors([[0.0, 0.0, 1.0]], normal[None])[0].as_matrix()
-    T[2, 3] = height_m
-    return T
-
-
-def _placements(
-    own: _Seen, placed: _Placed, T_up_base: Array, guess: Array | None
-) -> list[_Placement]:
+def _placements(own: _Seen, placed: _Placed, T_up_base: Array, near: _Near) -> list[_Placement]:
     """Refined placements that differ: of the guess, and of peaks of the images from above."""
     headings, offsets, score = _correlate(own, placed, T_up_base)
 
@@ -155,16 +145,18 @@ def _placements(
         at = np.linalg.norm(offsets - T[:2, 3], axis=-1)
         return np.abs((turned + 180.0) % 360.0 - 180.0), at
 
-    if guess is not None:  # only near it
-        turned, shifted = away(guess)
-        score[turned > _NEAR_DEG] = -np.inf
-        score[:, shifted > _NEAR_M] = -np.inf
+    guess = near.place
+    if near.turn is not None:
+        score[away(near.turn)[0] > _NEAR_DEG] = -np.inf
+    if guess is not None:
+        score[:, away(guess)[1] > _NEAR_M] = -np.inf
     known = [
         join_planes([of.planes[i].moved(T) for of, T in placed.values()])
         for i in range(len(own.planes))
     ]
     found, similar = list[_Placement](), np.zeros(len(headings))
-    for number in range(_TRIED):
+    slides = near.turn is not None and guess is None
+    for number in range(_TRIED_ALONG if slides else _TRIED):
         turn, i, j = np.unravel_index(int(score.argmax()), score.shape)
         T = _turn(headings[turn])
         T[:2, 3] = offsets[i, j]
@@ -176,10 +168,11 @@ def _placements(
         refined = _refined(known, own.planes, start, T_up_base[2, :3])
         found += [each for each in refined if guess is None or _is_near(each.T, guess)]
         for T in (start, *(each.T for each in refined)):
-            turned, shifted = away(T)
-            score[(turned <= _PEAK_DEG)[:, None, None] & (shifted <= _PEAK_M)] = -np.inf
-        similar += away(start)[0] <= _BAND_DEG
-        score[similar >= _PER_HEADING] = -np.inf
+            angles, shifted = away(T)
+            score[(angles <= _PEAK_DEG)[:, None, None] & (shifted <= _PEAK_M)] = -np.inf
+        if near.turn is None:
+            similar += away(start)[0] <= _BAND_DEG
+            score[similar >= _PER_HEADING] = -np.inf
     return found
 
 

@@ -26,19 +26,23 @@ MOUNTS = {
 ALL_AROUND_DEG = np.arange(-180.0, 180.0, 1.0)
 
 
-def draw_place(rng: np.random.Generator, *, boxes: int = 14, fronts: bool = True) -> Array:
+def draw_place(
+    rng: np.random.Generator, *, boxes: int = 14, fronts: bool = True, ahead_m: float = 0.0
+) -> Array:
     """(n, 2, 3) corners of the boxes of a place [m]: houses, cars; x ahead, z over the road."""
     found = []
     for side in (-1.0, 1.0) if fronts else ():
         x = -45.0
-        while x < 45.0:  # houses of other depths along the road
+        while x < 45.0 + ahead_m:  # houses of other depths along the road
             length, back = rng.uniform(6, 14), rng.uniform(7, 13)
             found.append(
                 [[x, side * back, 0.0], [x + length, side * (back + 8.0), rng.uniform(5, 12)]]
             )
             x += length + rng.uniform(0, 5)
     for _ in range(boxes):
-        low = np.array([rng.uniform(-30, 30), rng.choice([-1, 1]) * rng.uniform(3.5, 6.5), 0.0])
+        low = np.array(
+            [rng.uniform(-30, 30 + ahead_m), rng.choice([-1, 1]) * rng.uniform(3.5, 6.5), 0.0]
+        )
         found.append([low, low + rng.uniform([0.4, 0.4, 0.8], [4.5, 2.0, 2.5])])
     return np.sort(np.array(found, dtype=np.float64).reshape(-1, 2, 3), axis=1)
 

@@ -92,7 +92,16 @@ def test_the_report_has_a_table_of_lidars(result: Calibration):
         and "top in base_link" in page
         and "All LiDARs" in page
         and "All cameras" not in page
+        and 'alt="Clouds of LiDARs from above, after"' in page
     )
+
+
+def test_clouds_that_are_gone_leave_their_pictures_out_of_the_report(result: Calibration):
+    gone = [
+        {**entry, "lidars": dict.fromkeys(entry["lidars"], "gone.npy")} for entry in result.frames
+    ]
+    page = render_page(replace(result, frames=tuple(gone)))
+    assert "Pictures of clouds are left out:</b> gone.npy: no such file" in page
 
 
 def test_the_command_writes_and_prints_all_lidars(tmp_path: Path, call: Call):
