@@ -17,8 +17,8 @@ from calibgraph.io.dataset import Dataset, spread_out
 from calibgraph.io.frame import Frame
 from calibgraph.matching.cloud_similarity import find_upright
 from calibgraph.model.config import Config
-from calibgraph.model.geometry import transform
-from calibgraph.model.rig import Lidar, Rig, Vehicle
+from calibgraph.model.geometry import move_points, transform
+from calibgraph.model.rig import Rig, Vehicle
 from calibgraph.model.verdict import ABOUT_THE_DATA, Check, Verdict
 from calibgraph.progress import Progress
 from calibgraph.trust.probability import TABLES, judge, probability_beyond
@@ -58,14 +58,12 @@ class LidarResult:
     """What is found of a rig's LiDARs.
 
     Attributes:
-        lidars: the rig's, with T_base_lidar and its covariance.
         vehicle: the rig's, with T_vehicle_lidar and its sigmas; None if the rig has none.
         poses: of them.
         verdicts: per LiDAR but the base.
         warnings: about the instants and the start, a line each.
     """
 
-    lidars: Mapping[str, Lidar]
     vehicle: Vehicle | None
     poses: LidarPoses
     verdicts: Mapping[str, Verdict]
@@ -112,10 +110,6 @@ def calibrate_rig_lidars(
         parts, doubts, warnings = [*parts, poses], doubts | more, [*warnings, line]
     poses = join_poses(parts, [rig.lidar, *guess])
     clouds = _at_stamps(instants, poses.T_base_lidar)
-    lidars = {rig.lidar: Lidar()} | {
-        name: Lidar(T_base_lidar=poses.T_base_lidar[name], covariance=poses.covariance[name])
-        for name in rig.other_lidars
-    }
     vehicle = None
     if rig.vehicle is not None:
         progress("finding the vehicle's frame", 0, 1)
@@ -124,7 +118,6 @@ def calibrate_rig_lidars(
     for line in warnings:
         _log.warning(line)
     return LidarResult(
-        {name: lidars[name] for name in rig.lidars or {}},
         vehicle,
         poses,
         {
@@ -215,7 +208,7 @@ def _road(clouds: Mapping[str, Sequence[Array]], poses: LidarPoses) -> Road | No
     """The road by the clouds of all LiDARs together; None if they show none."""
     joined = [
         np.concatenate([
-            cloud[:, :3] @ T[:3, :3].T + T[:3, 3]
+            move_points(cloud, T)
             for cloud, T in zip(at, poses.T_base_lidar.values(), strict=True)
         ])
         for at in zip(*(clouds[name] for name in poses.T_base_lidar), strict=True)
