@@ -24,9 +24,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from factors import kernel
-from factors.arrays import read_only
+from factors.arrays import contiguous, read_only
 from factors.lens import Lens, LensModel
 from factors.lens_kernels import FISHEYE, OMNIDIRECTIONAL, PINHOLE
+from factors.pose_kernel import exponential_times
 
 Array = NDArray[np.float64]
 
@@ -52,7 +53,6 @@ _MODELS: Mapping[int, tuple[LensModel, int]] = {
     FISHEYE: ("fisheye", 4),
     OMNIDIRECTIONAL: ("omnidirectional", 5),
 }
-_SMALL_RAD = 1e-4  # of turn, below which the series are as exact
 
 
 @dataclass(frozen=True)
@@ -83,22 +83,11 @@ def displace(points_m: Array, twists_per_s: Array, seconds: ArrayLike) -> Array:
         twists_per_s: (6,) or (n, 6) rotation [rad/s] and translation [m/s].
         seconds: t, a number or (n,).
     """
-    w, v = np.split(np.atleast_2d(twists_per_s), 2, axis=1)
-    t, rate = (
-        np.reshape(np.asarray(seconds, np.float64), (-1, 1)),
-        np.linalg.norm(w, axis=1)[:, None],
-    )
-    angle = rate * t
-    small = np.abs(angle) < _SMALL_RAD
-    r = np.where(small, 1.0, rate)
-    first = np.where(small, t, np.sin(angle) / r)
-    second = np.where(small, t**2 / 2, (1 - np.cos(angle)) / r**2)
-    third = np.where(small, t**3 / 6, (angle - np.sin(angle)) / r**3)
-    turned, turned_v = np.cross(w, points_m), np.cross(w, v)
-    return np.asarray(
-        points_m + first * turned + second * np.cross(w, turned)
-        + t * v + second * turned_v + third * np.cross(w, turned_v)
-    )  # fmt: skip
+    steps = np.empty((len(points_m), 6))
+    steps[:] = np.reshape(seconds, (-1, 1)) * twists_per_s
+    T, moved = np.tile(np.eye(4), (len(steps), 1, 1)), np.empty((len(steps), 4, 4))
+    exponential_times(contiguous(steps), contiguous(T), moved)
+    return np.asarray(np.einsum("nij,nj->ni", moved[:, :3, :3], points_m) + moved[:, :3, 3])
 
 
 @dataclass(frozen=True, eq=False)

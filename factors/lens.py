@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from factors.arrays import contiguous
 from factors.kernel import COLUMNS, RESIDUALS, pass_over
-from factors.lens_kernels import FISHEYE, OMNIDIRECTIONAL, PINHOLE
+from factors.lens_kernels import FISHEYE, LIMIT, OMNIDIRECTIONAL, PINHOLE
 
 Array = NDArray[np.float64]
 LensModel = Literal["pinhole", "fisheye", "omnidirectional"]
@@ -40,7 +40,7 @@ ORDERS: dict[LensModel, str] = {
 """The distortion coefficients of each model in their order, which is OpenCV's."""
 _IDENTITY = np.eye(4)[None]
 _MAX_PLANE_RADIUS = math.tan(math.radians(85.0))  # polynomials are not fitted beyond
-_TABLE = 500
+_TABLE, _MOST_AHEAD = 500, math.radians(89.9)
 _MAX_XI = 100.0  # beyond, the model is a parallel projection, whose focal length is not determined
 _ITERATIONS = 20  # of Newton; 3 to 6 are enough but near the limit of a lens
 _CONVERGED_PX = 1e-10
@@ -205,21 +205,6 @@ _KINDS: dict[LensModel, tuple[int, Callable[[tuple[float, ...]], float]]] = {
 """The kind of each model, and the limit of its domain by its coefficients."""
 
 
-def _first_omnidirectional_rays(packed: Array, points: Array) -> Array:
-    """(n, 3) unit rays of points (n, 2) on the plane, but for the tangential distortion.
-
-    Args:
-        packed: parameters of the lens.
-        points: distorted, in focal lengths from the principal point.
-    """
-    xi, k1, k2 = packed[4:7]
-    angle = np.linspace(0.0, packed[12], _TABLE)
-    radius = np.sin(angle) / (np.cos(angle) + xi)
-    found = np.interp(np.hypot(*points.T), radius * (1 + radius**2 * (k1 + radius**2 * k2)), angle)
-    sideways = np.sin(found) / np.maximum(np.hypot(*points.T), np.finfo(float).tiny)
-    return np.column_stack([points * sideways[:, None], np.cos(found)])
-
-
 def unproject(lens: Lens, pixels_px: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:
     """Viewing rays of pixels, by Newton's method on the unit sphere.
 
@@ -264,16 +249,14 @@ def _right_inverse(jacobians: Array) -> Array:
 
 
 def _first_rays(lens: Lens, pixels: Array) -> Array:
-    """(n, 3) rays without distortion."""
+    """(n, 3) rays by a table of the radius over the angle, as if there were no tangential terms."""
     fx, fy, cx, cy = lens.packed[:4]
-    x, y = (pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy
-    if lens.kind == OMNIDIRECTIONAL:
-        return _first_omnidirectional_rays(lens.packed, np.column_stack([x, y]))
-    radius = np.hypot(x, y)
-    if lens.kind == FISHEYE:
-        angle = np.minimum(radius, 0.9 * lens.packed[-1])
-        sideways = np.sin(angle) / np.maximum(radius, np.finfo(float).tiny)
-        return np.column_stack([x * sideways, y * sideways, np.cos(angle)])
-    inside = np.minimum(1.0, lens.packed[-1] / np.maximum(radius, np.finfo(float).tiny))
-    rays = np.column_stack([x * inside, y * inside, np.ones(len(x))])
-    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+    plane = np.column_stack([(pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy])
+    limit = lens.packed[LIMIT]
+    angle = np.linspace(0.0, math.atan(limit) if lens.kind == PINHOLE else limit, _TABLE)
+    angle = np.minimum(angle, _MOST_AHEAD if lens.kind == PINHOLE else math.inf)
+    along = lens.project(np.column_stack([np.sin(angle), np.zeros(_TABLE), np.cos(angle)]))[0]
+    radius = np.hypot(*plane.T)
+    found = np.interp(radius, np.maximum.accumulate((along[:, 0] - cx) / fx), angle)
+    sideways = np.sin(found) / np.maximum(radius, np.finfo(float).tiny)
+    return np.column_stack([plane * sideways[:, None], np.cos(found)])

@@ -170,7 +170,7 @@ def _errors_at(T_camera_lidar: Array, matches: CameraBlock, gate_px: float) -> R
 
 
 def constrained(residuals: Array, information: Array | None) -> Array:
-    """(n, 2) I^(1/2) r / lambda_max^(1/2); its length is ``whitening.constrained_error_px``.
+    """(n, 2) I^(1/2) r / lambda_max^(1/2); its length is the constrained error.
 
     The root of a 2x2 matrix I is (I + sqrt(det I) E) / sqrt(tr I + 2 sqrt(det I)).
     """

@@ -143,8 +143,8 @@ def weigh_all_frames(
     *,
     config: Config,
     terms: Terms,
-) -> dict[str, tuple[CameraBlock, Array, int]]:
-    """Per camera, as of :func:`weigh_frames`; its correspondences, weighted by their residuals.
+) -> tuple[dict[str, CameraBlock], dict[str, Array], dict[str, int]]:
+    """Per camera, the three of :func:`weigh_frames`.
 
     Unchanged if ``learnt_weights`` is off, Stage 1 is not PnP, or ``terms`` has no reprojection
     term.
@@ -157,8 +157,9 @@ def weigh_all_frames(
         config: ``learnt_weights``, ``stage1``.
         terms: of the objective.
     """
-    if not (config.learnt_weights and config.stage1 == "pnp" and terms in USING_CORRESPONDENCES):
-        return {name: (block, start[name], 0) for name, block in blocks.items()}
+    is_wanted = config.learnt_weights and config.stage1 == "pnp" and terms in USING_CORRESPONDENCES
+    if not (blocks and is_wanted):
+        return dict(blocks), {}, {}
 
     def weigh(name: str) -> tuple[CameraBlock, Array, int]:
         return weigh_frames(
@@ -169,7 +170,9 @@ def weigh_all_frames(
             most_px=config.pnp_threshold_px,
         )
 
-    return dict(zip(blocks, map_on_cores(weigh, [*blocks]), strict=True))
+    weighed = zip(*map_on_cores(weigh, [*blocks]), strict=True)
+    kept, densest, outliers = (dict(zip(blocks, each, strict=True)) for each in weighed)
+    return kept, densest, outliers
 
 
 def weigh_frames(
@@ -217,7 +220,7 @@ def find_consensus(frames: FrameFits, start: Array) -> tuple[Array, Array]:
     """
     center, noise = start, frames.noise
     typical = float(np.median(noise))
-    T_lidar_camera = invert(frames.T_camera_lidar)
+    T_lidar_camera, hessians = invert(frames.T_camera_lidar), frames.hessians.reshape(-1, 36)
     by_chance, own = _CHANCE * np.maximum(noise - typical, 0), frames.spreads**2
     for number in range(_STEPS):
         away = local_coordinates(center, T_lidar_camera)
@@ -231,8 +234,9 @@ def find_consensus(frames: FrameFits, start: Array) -> tuple[Array, Array]:
             return start, np.ones(len(near))
         scatter = max(float(near @ (shift - noise) / near.sum()), 0.0)
         weights = near / (own + frames.counts * scatter / 6)
-        hessian = np.tensordot(weights, frames.hessians, axes=1)
-        step = np.linalg.solve(hessian + DAMPING * np.diag(hessian.diagonal()), weights @ products)
+        hessian = (weights @ hessians).reshape(6, 6)
+        hessian.flat[::7] *= 1 + DAMPING
+        step = np.linalg.solve(hessian, weights @ products)
         center = retract_all(center[None], step[None])[0]
         if number > _SEARCH_STEPS and np.abs(step).max() < _CONVERGED:
             break

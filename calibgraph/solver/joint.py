@@ -67,58 +67,53 @@ def solve_joint(
     Raises:
         CorrespondenceError, ValueError: as of :func:`calibgraph.solve`.
     """
-    if terms not in TERMS:
-        raise ValueError(f"unknown terms {terms!r}; known are {', '.join(TERMS)}")
     config, watch = config or Config(), Stopwatch()
-    require_known(rig.require_cameras(), config.excluded_cameras)
-    _require_same_cameras(rig, camera_matches)
+    _require_valid(rig, config, terms, camera_matches)
     if lenses is None and config.estimate:
         return _solve_with_lenses(rig, table, config, terms, camera_matches=camera_matches)
 
-    with watch("preprocess"):
-        kept = preprocess(rig, table, config)                              # Correspondence
+    with watch("preprocess"):                                              # Correspondence
+        kept = preprocess(rig, table, config)                              # Preprocessing
         if config.stage1 is None:
             config = config.model_copy(update={"stage1": kept.table.findings.stage1})
         tied = tying_pairs(camera_matches) if terms in USING_CORRESPONDENCES else []
-        held = require_determined(                                         # Preprocessing
-            rig, kept.counts, tied, config.excluded_cameras)
-
+        held = require_determined(rig, kept.counts, tied, config.excluded_cameras)
     with watch("stage1"):
         blocks = camera_blocks(rig, kept.table, config)                    # weights w_ik
         pairwise = pairwise or estimate_stage1(rig, blocks, config)        # Stage 1: T_hat
         start = best_start(rig, blocks, pairwise, config, terms=terms, tied=tied)     # x_0
-
     with watch("weights"):                                                 # ours: frame weights
         weighed = weigh_all_frames(kept.table, blocks, pairwise, start, config=config, terms=terms)
-        blocks = {name: block for name, (block, *_) in weighed.items()}
-        start |= {name: densest for name, (_, densest, _) in weighed.items()}
-
+        blocks, densest, outlier_frames = weighed
     objective = Objective(                                                 # Eq. 5
         rig, blocks, T_hat(pairwise), config, terms, lenses=lenses or {})
-
     with watch("pass1"):                                                   # Two-Pass Solver
-        rough, scales = objective.minimize_with_scale(start)           # 1. fit
+        rough, scales = objective.minimize_with_scale(start | densest)     # 1. fit
     with watch("pass2"):
         inliers = objective.without_outliers(rough, scales)                # 2. gate tau
         optimum = inliers.minimize(rough, scales)                          # 3. fit again
-
     with watch("error_model"):                                             # ours: shared errors
         errors, optimum = refine_with_error_model(
             FittedObjective(inliers, scales, optimum.T_camera_lidar, held),
             optimum, kept.table.findings, kept.table.places)
 
     require_in_reach(optimum.T_camera_lidar)
-    outlier_frames = {name: outliers for name, (*_, outliers) in weighed.items()}
     counts = count_correspondences(
-        kept, objective, inliers, pairwise, outlier_frames=outlier_frames
-    )
-    seconds = watch.seconds
+        kept, objective, inliers, pairwise, outlier_frames=outlier_frames)
     found = Solution(
-        rig, kept.table, objective, inliers, scales, optimum, counts, seconds,
-        held=held, errors=errors,
-    )
+        rig, kept.table, objective, inliers, scales, optimum, counts, watch.seconds,
+        held=held, errors=errors)
     return found if camera_matches is None else add_camera_pairs(found, camera_matches)
 # fmt: on
+
+
+def _require_valid(
+    rig: Rig, config: Config, terms: Terms, camera_matches: CameraMatches | None
+) -> None:
+    if terms not in TERMS:
+        raise ValueError(f"unknown terms {terms!r}; known are {', '.join(TERMS)}")
+    require_known(rig.require_cameras(), config.excluded_cameras)
+    _require_same_cameras(rig, camera_matches)
 
 
 def _require_same_cameras(rig: Rig, matches: CameraMatches | None) -> None:

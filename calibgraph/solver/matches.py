@@ -21,7 +21,6 @@ from calibgraph.solver.robust import (
     IDENTITY,
     MIN_SIGMA_PX,
     ResidualScale,
-    constrained_error_px,
     constrained_root,
     error_gradient,
     median_norm,
@@ -30,7 +29,6 @@ from calibgraph.solver.robust import (
     robust_spread,
     scale_from,
     sqrt_information,
-    whitened_norm,
 )
 from factors import ProjectionBlock
 
@@ -131,10 +129,17 @@ class CameraBlock:
         if self.information is None:
             norms = self.block.run_norms(T_camera_lidar, runs, factor=1.0 / float(medians))
             return norms[0], norms[-1]
-        residuals, projectable = self.block.residuals(T_camera_lidar, runs)
-        sizes_px = constrained_error_px(residuals, self.information) / medians
-        sizes = whitened_norm(self.block.sqrt_information, residuals) / medians
-        return np.where(projectable, sizes_px, np.inf), np.where(projectable, sizes, np.inf)
+        sizes_px = self._constrained.run_norms(T_camera_lidar, runs)[-1] / medians
+        return sizes_px, self.block.run_norms(T_camera_lidar, runs)[-1] / medians
+
+    @cached_property
+    def _constrained(self) -> ProjectionBlock:
+        """Whitened so that the norms are errors along the directions that matches constrain [px].
+
+        The plain reprojection error where no information is given; for an edge, the distance.
+        """
+        given = self.information
+        return self.block.rewhiten(None if given is None else constrained_root(given))
 
     def without_outliers(self, T_camera_lidar: Array, scale: ResidualScale) -> CameraBlock:
         """The inliers (paper, two-pass solver, step 2): within the gate, and projectable."""
@@ -152,16 +157,15 @@ class CameraBlock:
         the other, and their gradients with them. The term is some percent of the Hessian, and
         negative. It is measured on the matches near the edge, on both sides of it.
         """
-        residuals, projectable = self.block.residuals(T_camera_lidar[None])
-        errors = constrained_error_px(residuals, self.information)
+        T = T_camera_lidar[None]
+        errors, whitened = (b.run_norms(T)[-1] for b in (self._constrained, self.block))
         near = np.abs(errors - scale.gate_px) < _GATE_BAND * scale.gate_px
-        edge = self.select(near & projectable)
-        residuals, errors = residuals[near & projectable], errors[near & projectable]
-        across = error_gradient(residuals, errors, edge.information)
-        across *= (whitened_norm(edge.block.sqrt_information, residuals) / errors)[:, None]
+        edge = self.select(near)
+        across = error_gradient(edge.block.residuals(T)[0], errors[near], edge.information)
+        across *= (whitened[near] / errors[near])[:, None]
         root = np.column_stack([across, np.zeros(len(across))])
         weighted = replace(edge, block=edge.block.rewhiten(root)).with_scale(scale)
-        return np.asarray(-weighted.summarize(T_camera_lidar[None]).hessian[0] / (2 * _GATE_BAND))
+        return np.asarray(-weighted.summarize(T).hessian[0] / (2 * _GATE_BAND))
 
     def summary(self, T_camera_lidar: Array, scale: ResidualScale) -> Residuals:
         """What a result reports of the residuals at its extrinsic."""
@@ -178,9 +182,7 @@ class CameraBlock:
         """Which of some T_camera_lidar has the least mean Cauchy loss, over an even selection."""
         if len(candidates) == 1:
             return 0
-        sample = self.select_evenly(_MAX_SAMPLE)
-        root = None if sample.information is None else constrained_root(sample.information)
-        errors = sample.block.rewhiten(root).rescale(scale=scale_px)
+        errors = self.select_evenly(_MAX_SAMPLE)._constrained.rescale(scale=scale_px)
         return int(np.argmin(errors.costs_at_each(np.array(candidates))))
 
     def scale(self, T_camera_lidar: Array, config: Config) -> ResidualScale:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from itertools import accumulate, pairwise
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,12 +108,12 @@ def _spreads(
     values: Array, runs: NDArray[np.int64], start: tuple[float, float], rounds: int
 ) -> Array:
     """(r,) see :func:`_fill_spreads`."""
-    parts, found = [values[first:end] for first, end in runs.tolist()], np.empty(len(runs))
-    edges = list(accumulate(map(len, parts), initial=0))
-    ordered = np.concatenate([*parts, values[:0]])
-    for first, end in pairwise(edges):
+    edges, found = np.zeros(len(runs) + 1, np.int64), np.empty(len(runs))
+    np.cumsum(runs[:, 1] - runs[:, 0], out=edges[1:])
+    ordered = np.concatenate([values[first:end] for first, end in runs.tolist()] or [values[:0]])
+    for first, end in pairwise(edges.tolist()):
         ordered[first:end].sort()
-    _fill_spreads(contiguous(ordered), contiguous(np.array(edges)), start, rounds, found)
+    _fill_spreads(contiguous(ordered), contiguous(edges), start, rounds, found)
     return found
 
 
@@ -181,22 +181,8 @@ def upper_root(information: Array) -> Array:
     return np.stack([s00, s01, s11], axis=1)
 
 
-def constrained_error_px(residuals: Array, information: Array | None) -> Array:
-    """(n,) length of the residual along the directions that the match constrains [px].
-
-    The plain reprojection error where no information is given; for an edge, the distance from it.
-    """
-    if information is None:
-        x, y = residuals.T
-        return np.asarray(np.sqrt(x * x + y * y))  # hypot takes ten times as long
-    uu, uv, vv = information.T
-    x, y = residuals.T
-    squared = uu * x**2 + 2 * uv * x * y + vv * y**2
-    return np.asarray(np.sqrt(np.maximum(squared, 0.0) / largest_eigenvalue(information)))
-
-
 def error_gradient(residuals: Array, errors: Array, information: Array | None) -> Array:
-    """(n, 2) derivative of :func:`constrained_error_px` by the residual.
+    """(n, 2) derivative of the constrained error by the residual, see :func:`constrained_root`.
 
     Args:
         residuals: (n, 2).
@@ -230,12 +216,3 @@ def median_norm(information: Array | None) -> Array:
     uu, uv, vv = information.T
     rank_one = uu * vv - uv**2 <= 1e-3 * (uu + vv) ** 2
     return np.asarray(MEDIAN_NORM[np.where(rank_one, 0, 1)])
-
-
-def whitened_norm(root: Array | None, residuals: Array) -> Array:
-    """(n,) lengths of the residuals times their whitening matrices, (n, 3) as above."""
-    if root is None:
-        return constrained_error_px(residuals, None)
-    first = root[:, 0] * residuals[:, 0] + root[:, 1] * residuals[:, 1]
-    second = root[:, 2] * residuals[:, 1]
-    return np.asarray(np.sqrt(first * first + second * second))

@@ -15,7 +15,7 @@ import gtsam
 import numpy as np
 
 from calibgraph.arrays import Array, Mask
-from calibgraph.graph.components import VarianceComponents, VarianceRatios, least_cost_of_distortion
+from calibgraph.graph.components import VarianceComponents, least_cost_of_distortion
 from calibgraph.graph.latent_poses import LatentPoseModel
 from calibgraph.graph.objective import objective_graph
 from calibgraph.model.findings import error_components
@@ -302,6 +302,7 @@ class EpochGraph:
             weights = own.open_weights(state, self.window.adjoint)
             found = own.eliminate(weights, self.window.adjoint)
             information, vector = information + found.information, vector + found.vector
+            self._open = own, weights, found
         self.window.exchange(information, vector)
         T, covariance = self.window.reported(state.config.of)
         if state.config.preset != "auto":
@@ -343,11 +344,9 @@ class EpochGraph:
 
         And (n, 4, 4) T_camera_lidar there.
         """
-        estimate = self.solve(state)
-        own = self.open_places(state, every_place(state, self.places, estimate.sums))
+        self.solve(state)
+        own, weights, found = self._open
         row, shown = own.names.index(state.at[-1]), self.window.shown
-        weights = own.open_weights(state, self.window.adjoint)
-        found = own.eliminate(weights, self.window.adjoint)
         u, v = own.apart(found, shown, weights)
         steps = shown + v[row] - (self.window.adjoint @ u[row])
         return own.squared(u, v)[row], retract_all(state.references, steps)
@@ -396,10 +395,10 @@ class EpochGraph:
             vector = sigmas * (weight @ bends[:, 63:])
         each = np.tile(np.eye(6), (1, n, 1, 1))
         cloud, camera = common_error(findings.rigid_sigmas, findings.camera_share)
-        prior = VarianceComponents(
-            cloud=cloud,
+        components = VarianceComponents(
+            cloud=shared * cloud,
             cloud_at_place=np.eye(6),
-            camera=camera,
+            camera=shared * camera,
             pairs=np.eye(6),
             at_place=each,
             scatter_at_place=each,
@@ -407,8 +406,8 @@ class EpochGraph:
             pair_distortion_jacobian=np.zeros_like(jacobian),
             distortion_information=shown,
             distortion_vector=vector,
+            distortion_size=shared,
         )
-        components = VarianceRatios(shared=shared).scale(prior)
         return SharedModel(state.names, {}, (), self.pose_graph, components, state.config.of)
 
 

@@ -263,20 +263,17 @@ class PlaceSums:
 
     def bounded(self, most: int = MOST_PLACES) -> PlaceSums:
         """The sums with no more places kept apart: those not visited longest are older."""
-        sums = self
-        while len(sums.names) > 1 + most:
-            sums = sums._merge_second()
-        return sums
-
-    def _merge_second(self) -> PlaceSums:
-        """The second row added to the first."""
-        second = self.rows[1]
-        second = second.change(score=0.0 * second.score, scatter=second.scatter_about_mean)
+        kept = max(len(self.names) - most, 1)  # first row of these
+        if kept == 1:
+            return self
+        old = self.rows[1:kept]
+        old = old.change(score=np.zeros_like(old.score), scatter=old.scatter_about_mean)
+        older = self.rows[:1] + Sums(old.packed.sum(axis=0, keepdims=True))
         return PlaceSums(
-            (_OLDER, *self.names[2:]),
-            self.rows.replace_at(1, self.rows[0] + second)[1:],
-            self.means + (second.frames > 0),
-            self.older_squared + second.frames**2,
+            (_OLDER, *self.names[kept:]),
+            Sums(np.concatenate([older.packed, self.rows[kept:].packed])),
+            self.means + np.count_nonzero(old.frames, axis=0),
+            self.older_squared + np.square(old.frames).sum(axis=0),
         )
 
     def without(self, camera: int) -> PlaceSums:

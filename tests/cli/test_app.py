@@ -77,7 +77,7 @@ def test_help_imports_nothing_heavy() -> None:
     assert done.returncode == 0, done.stderr
     for command in (
         "calibrate", "match", "solve", "report", "evaluate", "perturb", "export", "rig",
-        "simulate", "weights", "track",
+        "simulate", "track",
     ):  # fmt: skip
         assert command in done.stdout
 

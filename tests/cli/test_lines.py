@@ -87,7 +87,6 @@ simulate street --rig nosuch --out never | known are kitti, walkley, surround
 simulate street --beams 3 --out never | 3 beams
 simulate street --frames 0 --out never | 0 frames, 4.0 m apart: expected at least 1 frame
 simulate street --rotation-deg 200 --out never | expected an angle within
-weights bad.tar | bad.tar
 """
 CONFIGS = {
     "cpu": "device: cpu", "tpu": "device: tpu",

@@ -168,7 +168,6 @@ def test_every_command_names_them(tmp_path: Path, call: Call) -> None:
         f"calibrate {data} --out {tmp_path}/out",
         f"match {data} --out {tmp_path}/t.parquet",
         f"check {data}/rig.yaml {data}",
-        f"track {data}/rig.yaml {data} --matcher structure --out {tmp_path}/out",
     ):
         code, printed, errors = call(*command.split())
         assert code == (1 if command.startswith("doctor") else 2), command

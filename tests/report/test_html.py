@@ -21,7 +21,7 @@ from calibgraph.report.plots import (
     mean_residuals,
     reprojection_errors,
 )
-from calibgraph.solver.robust import constrained_error_px
+from calibgraph.solver.robust import constrained_root
 from tests.conftest import CommandRun
 from tests.report.browsing import render
 from tests.report.conftest import read_page, solve_simulated, write_page
@@ -150,7 +150,8 @@ def test_vectors_of_edges_have_the_length_that_the_gate_compares() -> None:
         [normals[:, 0] ** 2, normals[:, 0] * normals[:, 1], normals[:, 1] ** 2]
     ) + np.outer(rng.integers(0, 2, 50), [0.5, 0.1, 0.7])
     lengths = np.hypot(*constrained(residuals, edges).T)
-    np.testing.assert_allclose(lengths, constrained_error_px(residuals, edges), atol=1e-9)
+    (a, b, c), (x, y) = constrained_root(edges).T, residuals.T
+    np.testing.assert_allclose(lengths, np.hypot(a * x + b * y, c * y), atol=1e-9)
     np.testing.assert_array_equal(constrained(residuals, None), residuals)
 
 

@@ -21,7 +21,7 @@ from calibgraph import (
 )
 from calibgraph.solver import preprocess
 from calibgraph.solver.robust import (
-    constrained_error_px,
+    constrained_root,
     quantile,
     quantiles,
     robust_spread,
@@ -162,11 +162,9 @@ def test_whitening_is_a_root_of_the_information() -> None:
 
 
 def test_the_error_of_an_edge_is_the_distance_from_it() -> None:
-    residuals = np.array([[3.0, 4.0], [3.0, 4.0], [3.0, 4.0]])
-    information = np.array([[1.0, 0, 1], [7.0, 0, 0], [0.5, 0.5, 0.5]])
-    expected = [5.0, 3.0, 7 / np.sqrt(2)]
-    np.testing.assert_allclose(constrained_error_px(residuals, information), expected)
-    np.testing.assert_allclose(constrained_error_px(residuals, None), 5.0)
+    """Of the residual (3, 4)."""
+    a, b, c = constrained_root(np.array([[1.0, 0, 1], [7.0, 0, 0], [0.5, 0.5, 0.5]])).T
+    np.testing.assert_allclose(np.hypot(3 * a + 4 * b, 4 * c), [5.0, 3.0, 7 / np.sqrt(2)])
 
 
 def test_the_spread_of_a_core_is_found_under_a_broad_background() -> None:

@@ -9,15 +9,12 @@ import gtsam
 import numpy as np
 
 from calibgraph import (
-    Calibration,
     CorrespondenceError,
     Correspondences,
     IncrementalCalibrator,
     Rig,
     perturb,
-    solve,
 )
-from calibgraph.model.correspondences import concatenate
 from calibgraph.tracking.assessment import Update
 from calibgraph.tracking.frames import StreamFrame
 from tests.tracking.drives import drive, drive_at, pair_of
@@ -32,23 +29,6 @@ def frames_of(tables: Sequence[Correspondences]) -> list[StreamFrame]:
 
 def guess_of(rig: Rig) -> Rig:
     return perturb(rig, rotation_deg=1, translation_m=0.1, seed=1)
-
-
-def together(
-    tracker: IncrementalCalibrator, frames: Sequence[StreamFrame]
-) -> tuple[list[Update], list[int]]:
-    """The updates, and how many frames were taken in at once each time."""
-    groups = [found for found in tracker.update_all(frames) if isinstance(found, list)]
-    return [update for group in groups for update in group], [*map(len, groups)]
-
-
-def sigmas_apart(one: Update, two: Update | Calibration, camera: str) -> float:
-    """Length of the six-vector between two estimates, in the second's error bar."""
-    covariance = two.covariance[camera]
-    assert covariance is not None
-    step = one.T_camera_lidar[camera] @ np.linalg.inv(two.T_camera_lidar[camera])
-    xi = gtsam.Pose3.Logmap(gtsam.Pose3(step))
-    return float(np.sqrt(xi @ np.linalg.solve(covariance, xi)))
 
 
 def test_frames_that_come_together_give_the_numbers_of_one_by_one() -> None:
@@ -74,36 +54,6 @@ def test_frames_that_come_together_give_the_numbers_of_one_by_one() -> None:
         if found[-1].frame % EPOCH == EPOCH - 1:
             assert tracker.to_bytes() == state
     assert max(groups) == EPOCH and len(groups) < len(tables) / 3
-
-
-def test_along_places_estimates_are_those_of_a_batch() -> None:
-    """The end of an epoch is exact."""
-    rig = pair_of()
-    tables = drive(rig, 60, matches=200)
-    found, _ = together(
-        IncrementalCalibrator(guess_of(rig)),
-        [
-            StreamFrame(i, replace(table, metadata={**table.metadata, "place": str(i // 7 % 3)}))
-            for i, table in enumerate(tables)
-        ],
-    )
-    batch = solve(guess_of(rig), concatenate(tables))
-    for camera in rig.cameras:
-        assert sigmas_apart(found[-1], batch, camera) < 0.2 * np.sqrt(6)
-
-
-def test_a_small_step_is_found_at_the_same_frame_as_one_by_one() -> None:
-    """It shows at the end of an epoch."""
-    rig = pair_of()
-    small = gtsam.Pose3.Expmap(0.15 * STEP).matrix()
-    after = rig.moved_to({"left": small @ rig.T_camera_lidar["left"]})
-    tables = drive_at(lambda frame: after if frame >= 123 else rig, 180, matches=200, seed=3)
-    alone = IncrementalCalibrator(guess_of(rig))
-    expected = [event for table in tables for event in alone.update(table).events]
-    found, groups = together(IncrementalCalibrator(guess_of(rig)), frames_of(tables))
-    assert [e.kind for e in expected][2:] == ["moved"]
-    assert [event for update in found for event in update.events] == expected
-    assert len(groups) < len(tables) / 3
 
 
 def one_by_one(

@@ -60,14 +60,6 @@ def test_older_places_are_one_row_that_counts_as_many() -> None:
         np.testing.assert_allclose(found, expected)
 
 
-def test_a_camera_restarts_without_the_others() -> None:
-    sums = sums_of(part("a", 0), part("b", 1)).bounded(most=1)
-    left = sums.without(0)
-    assert not left.frames[:, 0].any() and not left.rows.scatter[:, 0].any() and not left.means[0]
-    np.testing.assert_array_equal(left.rows.hessian[:, 1], sums.rows.hessian[:, 1])
-    np.testing.assert_array_equal(left.rows.scatter[:, 1], sums.rows.scatter[:, 1])
-
-
 @pytest.mark.parametrize("name", ["b", "c"])
 def test_what_a_drift_leaves_is_of_one_place(name: str) -> None:
     """The drift discounts the sums, of which none are kept place by place."""
