@@ -102,12 +102,22 @@ def calibrate_rig_lidars(
     progress("locating LiDARs", 0, 1)
     views = _look(instants, guess, rig.lidar)
     start, doubts, lost = locate_lidars(views, guess, base=rig.lidar)
-    parts = [_solve(instants, views, start, base=rig.lidar)] if start else []
+    parts = list[LidarPoses]()
     if lost:
         progress("joining LiDARs by motion", 0, 1)
         far = {name: T for name, T in guess.items() if name not in start}
-        poses, more, line = _join_by_motion(drive, instants, far, lost, base=rig.lidar)
-        parts, doubts, warnings = [*parts, poses], doubts | more, [*warnings, line]
+        known = {name: T for name, T in far.items() if T is not None}
+        try:
+            poses, more, line = _join_by_motion(drive, instants, far, lost, base=rig.lidar)
+            parts, doubts = [poses], doubts | more
+        except CalibrationError:
+            if len(known) < len(far):
+                raise
+            start, line = {**start, **known}, f"{lost}; begun from the guess"
+        warnings.append(line)
+    progress("calibrating LiDARs", 0, 1)
+    if start:
+        parts.append(_solve(instants, views, start, base=rig.lidar))
     poses = join_poses(parts, [rig.lidar, *guess])
     clouds = _at_stamps(instants, poses.T_base_lidar)
     vehicle = None
@@ -157,19 +167,18 @@ def _join_by_motion(
     """The poses of LiDARs that share too little at one time, doubts of them, and a line.
 
     They are calibrated to what the base sees before and after.
+
+    Raises:
+        CalibrationError: if the motion is unknown, or they share too little with that, too.
     """
     maps, at, after = list[View](), list[Instant](), -1
     for instant in instants:
         if instant.frame > after and (found := drive.local_map(instant.frame, base)) is not None:
             after = found[1]
             maps, at = [*maps, found[0]], [*at, instant]
-    known = {name: T for name, T in guess.items() if T is not None}
     if not maps:
-        if len(known) < len(guess):
-            raise CalibrationError(f"{lost}; {_HOW_TO_JOIN}")
-        views = _look(instants, known, base)
-        return _solve(instants, views, known, base=base), {}, f"{lost}; begun from the guess"
-    turned = {name: T for name in guess if name not in known
+        raise CalibrationError(f"{lost}; {_HOW_TO_JOIN}")
+    turned = {name: T for name, given in guess.items() if given is None
               and (T := _turn_by_motion(drive, at, name, maps)) is not None}  # fmt: skip
     near = {**guess, **turned}
     views = {**_look(at, near, base), base: maps}
