@@ -41,6 +41,8 @@ MOST_INSTANTS = 20
 
 MAP_SIGMAS = np.repeat([np.radians(0.1), 0.03], 3)
 """(6,) [rad, m]: prior of what the motion within a local map adds to a pose, as PLACE_SIGMAS."""
+_COMMON_SIGMAS = np.repeat([0.0, 0.001 * REACH_M], 3)
+"""(6,) [rad, m] that all maps share: of ranges that are 0.1 % too long."""
 _HOW_TO_JOIN = (
     "or drive 150 m past walls, with times of points, and stamps in the names of clouds or in "
     "times.txt, so that LiDARs are joined by motion"
@@ -188,7 +190,9 @@ def _join_by_motion(
                                f"too: {lost}")  # fmt: skip
     line = (f"{', '.join(guess)} and {base} share too little at one time: joined by motion, at "
             f"{len(maps)} places of what {base} sees {REACH_M:g} m before and after")  # fmt: skip
-    return _solve(at, views, start, base=base, maps=maps), doubts, line
+    poses = _solve(at, views, start, base=base, maps=maps)
+    common = np.diag(np.tile(_COMMON_SIGMAS**2, len(guess)))
+    return replace(poses, joint_covariance=poses.joint_covariance + common), doubts, line
 
 
 def _turn_by_motion(
