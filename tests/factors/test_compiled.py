@@ -93,8 +93,8 @@ def test_with_a_read_only_folder_kernels_are_compiled_in_memory_and_one_line_rep
     packages = tmp_path / "packages"
     shutil.copytree("factors", packages / "factors", ignore=shutil.ignore_patterns("__pycache__"))
     (packages / "factors").chmod(0o555)
-    two = ROOT + "\nfrom factors import Lens; lens = Lens.of('pinhole', fx=1, fy=1, cx=0, cy=0)"
-    two += "; print(lens.project([[0.0, 0.0, 2.0]])[1][0])"
+    (packages / "second.py").write_text(HELPER.format(half=0.5, factor=2))
+    two = ROOT + "\nfrom second import twice; print(twice(2.0) == 4.0)"
     out, err = run(two, path=packages, **{variable: str(read_only)})
     assert out.splitlines() == ["True 0", "True"]
     assert err.startswith(NOT_KEPT) and err.count("\n") == 1
