@@ -178,7 +178,7 @@ def implausible(  # noqa: PLR0913 - a camera
         ({"distortion": (-0.5, 0, 0, 0)}, "reaches 22.3 deg from its axis, and not the whole"),
         (
             {"distortion": (1450, -5800, 4e-4, -7e-4, 5200)},
-            "4.49 deg from its axis, and not the whole",
+            "a: the lens reaches 4.49 deg from its axis",
         ),
         (
             {"model": "fisheye", "focal": (300, 300), "distortion": (1e3, 0, 0, 0)},
