@@ -27,7 +27,7 @@ from calibgraph.model.clock import odd_motions, unused_times
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.lens import with_sigmas
-from calibgraph.model.rig import Rig
+from calibgraph.model.rig import Lidar, Rig
 from calibgraph.parallel import Threads, with_own_threads
 from calibgraph.progress import Progress, Stopwatch, no_progress
 from calibgraph.rounds import AnyMatcher, Datasets, match_in_rounds, refine_with_camera_pairs
@@ -135,9 +135,14 @@ def _with_lidars(result: Calibration, found: LidarResult) -> Calibration:
     cameras, joint = result.joint_covariance, None
     if cameras is not None:
         joint = np.asarray(block_diag(cameras, found.poses.joint_covariance))
+    T, bars = found.poses.T_base_lidar, found.poses.covariance
+    lidars = {
+        name: Lidar(T_base_lidar=T[name], covariance=bars[name]) if name in bars else Lidar()
+        for name in result.rig.lidars or {}
+    }
     return replace(
         result,
-        rig=result.rig.model_copy(update={"lidars": dict(found.lidars), "vehicle": found.vehicle}),
+        rig=result.rig.model_copy(update={"lidars": lidars, "vehicle": found.vehicle}),
         joint_covariance=joint,
         lidar_verdicts=dict(found.verdicts),
         warnings=(*result.warnings, *found.warnings),

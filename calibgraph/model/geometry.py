@@ -32,6 +32,11 @@ def invert(T_a_b: Array) -> Array:
     return np.asarray(np.linalg.inv(T_a_b), dtype=np.float64)
 
 
+def move_points(points_b: Array, T_a_b: Array) -> Array:
+    """(n, 3) points in the frame a, of points in b."""
+    return np.asarray(points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3])
+
+
 def invert_each(T_a_b: Array) -> Array:
     """(f, 4, 4) T_b_a of as many rigid transforms: faster than :func:`invert`."""
     inverse = np.zeros_like(T_a_b)

@@ -12,6 +12,7 @@ from calibgraph.errors import CalibrationError
 from calibgraph.io.frame import frame_of_entry
 from calibgraph.matching.cloud_similarity import find_upright
 from calibgraph.model.calibration import Calibration
+from calibgraph.model.geometry import move_points
 from calibgraph.report.plots import png_uri
 
 # RGB colours that the colour-blind can tell apart (Okabe and Ito), the base first; then again.
@@ -46,7 +47,7 @@ def draw_lidars(result: Calibration) -> tuple[LidarViews | None, str]:
     except (CalibrationError, OSError) as error:
         return None, str(error)
     after, before = result.T_base_lidar, result.initial_rig.T_base_lidar
-    every = np.concatenate([_moved(cloud, after[name]) for name, cloud in clouds.items()])
+    every = np.concatenate([move_points(cloud, after[name]) for name, cloud in clouds.items()])
     try:
         T_up_base = find_upright(names[0], [every])
     except CalibrationError:  # no ground
@@ -54,7 +55,7 @@ def draw_lidars(result: Calibration) -> tuple[LidarViews | None, str]:
     colours = {name: _COLOURS[number % len(_COLOURS)] for number, name in enumerate(names)}
     placed = {"before": before, "after": after}
     points = {
-        title: {name: _moved(clouds[name], T_up_base @ T) for name, T in poses.items()}
+        title: {name: move_points(clouds[name], T_up_base @ T) for name, T in poses.items()}
         for title, poses in placed.items()
         if len(poses) > 1
     }
@@ -88,7 +89,3 @@ def _picture(
         blue, green, red = (int(colours[name][k : k + 2], 16) for k in (5, 3, 1))
         image[size[1] - 1 - row[inside], column[inside]] = blue, green, red
     return png_uri(image)
-
-
-def _moved(points: Array, T: Array) -> Array:
-    return np.asarray(points @ T[:3, :3].T + T[:3, 3])

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from calibgraph.arrays import Array
 from calibgraph.matching.cloud_similarity import find_upright
-from calibgraph.model.geometry import transform
+from calibgraph.model.geometry import move_points, transform
 from calibgraph.model.rig import VEHICLE_AXES, Vehicle
 from calibgraph.vehicle.travel import Travel
 
@@ -106,7 +106,7 @@ def find_road(clouds_base_m: Sequence[Array]) -> Road | None:
 
 def _plane(cloud: Array, T_up_base: Array) -> Array | None:
     """(4,) normal and height of the ground near the vehicle, in the axes of the base."""
-    points = cloud @ T_up_base[:3, :3].T + T_up_base[:3, 3]
+    points = move_points(cloud, T_up_base)
     points = points[np.hypot(points[:, 0], points[:, 1]) < _REACH_M]
     slope = np.zeros(3)  # z = slope . (x, y, 1)
     for gate_m in _GATES_M:

@@ -57,10 +57,7 @@ class LidarPoses:
     Attributes:
         base: its name.
         T_base_lidar: per LiDAR, (4, 4): p_base = T_base_lidar * p_lidar.
-        covariance: per LiDAR but the base, (6, 6) of xi = (rotation [rad], translation [m]) in the
-            base's axes: R = exp(rotation) R_estimate, t = t_estimate + translation, t being the
-            position of the LiDAR.
-        joint_covariance: (6 k, 6 k) of them all, in their order.
+        joint_covariance: (6 k, 6 k) of all but the base, in their order.
         matched: per LiDAR, the share of its planes near others' that lie on them (0-1).
         places: instants between which the vehicle has moved.
         place_ratios: variance of rotation and translation between places over its prior.
@@ -68,11 +65,21 @@ class LidarPoses:
 
     base: str
     T_base_lidar: Mapping[str, Array]
-    covariance: Mapping[str, Array]
     joint_covariance: Array
     matched: Mapping[str, float]
     places: int
     place_ratios: tuple[float, float]
+
+    @property
+    def covariance(self) -> dict[str, Array]:
+        """Per LiDAR but the base, (6, 6) of xi = (rotation [rad], translation [m]).
+
+        In the base's axes: R = exp(rotation) R_estimate, t = t_estimate + translation, t being the
+        position of the LiDAR.
+        """
+        rows = [slice(6 * row, 6 * row + 6) for row in range(len(self.T_base_lidar) - 1)]
+        names = [name for name in self.T_base_lidar if name != self.base]
+        return {n: self.joint_covariance[of, of] for n, of in zip(names, rows, strict=True)}
 
 
 def calibrate_lidars(
@@ -92,10 +99,8 @@ def calibrate_lidars(
 
     Raises:
         CalibrationError: if LiDARs see too little in common.
-        ValueError: if names or counts of views do not fit.
     """
     names = [base, *(name for name in views if name != base)]
-    _require_alike(views, T_base_lidar, names)
     planes = [[view.planes for view in views[name]] for name in names]
     kept = _distinct(planes[0])
     planes = [[of[i] for i in kept] for of in planes]
@@ -105,11 +110,9 @@ def calibrate_lidars(
     step, joint, ratios = combine_places(places, place_sigmas)
     T = _moved(T, step)
     near, on = count_matched(planes, T)
-    rows = [slice(6 * row, 6 * row + 6) for row in range(len(names) - 1)]
     return LidarPoses(
         base,
         dict(zip(names, T, strict=True)),
-        {name: joint[of, of] for name, of in zip(names[1:], rows, strict=True)},
         joint,
         dict(zip(names, (on / near).tolist(), strict=True)),
         len(places),
@@ -119,8 +122,8 @@ def calibrate_lidars(
 
 def join_poses(parts: Sequence[LidarPoses], names: Sequence[str]) -> LidarPoses:
     """Poses that were found independently of each other, in the order of names, the base first."""
-    covariance = {name: own for part in parts for name, own in part.covariance.items()}
-    rows = [6 * names.index(name) - 6 + axis for name in covariance for axis in range(6)]
+    order = [names.index(name) - 1 for part in parts for name in part.covariance]
+    rows = [6 * number + axis for number in order for axis in range(6)]
     joint = np.zeros((len(rows), len(rows)))
     joint[np.ix_(rows, rows)] = scipy.linalg.block_diag(*(part.joint_covariance for part in parts))
     return LidarPoses(
@@ -129,7 +132,6 @@ def join_poses(parts: Sequence[LidarPoses], names: Sequence[str]) -> LidarPoses:
             name: next(p.T_base_lidar[name] for p in parts if name in p.T_base_lidar)
             for name in names
         },
-        {name: covariance[name] for name in names[1:]},
         joint,
         {name: min(p.matched[name] for p in parts if name in p.matched) for name in names},
         min(part.places for part in parts),
@@ -176,16 +178,6 @@ def _distinct(planes: Sequence[Planes]) -> list[int]:
         if not stands:
             kept.append(number)
     return kept
-
-
-def _require_alike(views: Views, guess: Mapping[str, Array], names: Sequence[str]) -> None:
-    if names[0] not in views or len(names) == 1:
-        raise ValueError(f"clouds of {', '.join(views)}: of the base {names[0]} and another")
-    if missing := [name for name in names[1:] if name not in guess]:
-        raise ValueError(f"T_base_lidar has no guess of {', '.join(missing)}")
-    counts = {name: len(views[name]) for name in names}
-    if len({*counts.values()}) > 1:
-        raise ValueError(f"clouds of the same instants are needed; found {counts}")
 
 
 def _moved(T_base_lidar: Array, steps: Array) -> Array:

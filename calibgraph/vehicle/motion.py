@@ -22,7 +22,7 @@ from calibgraph.errors import CalibrationError, DatasetError
 from calibgraph.io.bag_frames import Trajectory, motion_by_poses, scans_beside
 from calibgraph.io.bags import MESSAGE_SUFFIX
 from calibgraph.io.frame import Frame, ScanSteps, twist_by_scans
-from calibgraph.model.geometry import invert
+from calibgraph.model.geometry import invert, move_points
 from calibgraph.vehicle.lidars import refine_poses
 from calibgraph.vehicle.planes import Planes, View, find_planes, join_planes
 from calibgraph.vehicle.travel import read_poses
@@ -64,11 +64,9 @@ class Instant:
         points, twist, times_s = self.clouds[lidar], self.twist_per_s, self.times_s[lidar]
         if twist is None or times_s is None or T_base_lidar is None:
             return points
-        return _moved(displace(_moved(points, T_base_lidar), twist, times_s), invert(T_base_lidar))
-
-
-def _moved(points: Array, T: Array) -> Array:
-    return np.asarray(points @ T[:3, :3].T + T[:3, 3])
+        return move_points(
+            displace(move_points(points, T_base_lidar), twist, times_s), invert(T_base_lidar)
+        )
 
 
 class Drive:
@@ -121,7 +119,7 @@ class Drive:
                 if sums.basis().shape[1] < len(_STILL):  # a direction is open
                     continue
                 drift[other > number] = T @ invert(T_odometry)
-            points.append(_moved(cloud, T))
+            points.append(move_points(cloud, T))
             planes.append(own.moved(T))
         if len(planes) <= 1:
             return None

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from calibgraph.arrays import Array
+from calibgraph.model.geometry import move_points
 
 _NEAREST_M, _FARTHEST_M = 1.0, 80.0  # the vehicle itself, and where planes are too few to match
 _SHARES = (0.04, 0.08, 0.16)  # radii of neighbourhoods over the range, in turn until one spreads
@@ -58,9 +59,8 @@ class Planes:
 
     def moved(self, T_base_lidar: Array) -> Planes:
         """The same in another frame, by (4, 4)."""
-        R = T_base_lidar[:3, :3]
-        centers = self.centers_m @ R.T + T_base_lidar[:3, 3]
-        return replace(self, centers_m=centers, normals=self.normals @ R.T)
+        centers, normals = move_points(self.centers_m, T_base_lidar), self.normals
+        return replace(self, centers_m=centers, normals=normals @ T_base_lidar[:3, :3].T)
 
 
 _NONE = Planes(np.empty((0, 3)), np.empty((0, 3)), np.empty(0), np.empty(0))

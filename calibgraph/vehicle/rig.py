@@ -17,8 +17,8 @@ from calibgraph.io.dataset import Dataset, spread_out
 from calibgraph.io.frame import Frame
 from calibgraph.matching.cloud_similarity import find_upright
 from calibgraph.model.config import Config
-from calibgraph.model.geometry import transform
-from calibgraph.model.rig import Lidar, Rig, Vehicle
+from calibgraph.model.geometry import move_points, transform
+from calibgraph.model.rig import Rig, Vehicle
 from calibgraph.model.verdict import ABOUT_THE_DATA, Check, Verdict
 from calibgraph.progress import Progress
 from calibgraph.trust.probability import TABLES, judge, probability_beyond
@@ -41,6 +41,8 @@ MOST_INSTANTS = 20
 
 MAP_SIGMAS = np.repeat([np.radians(0.1), 0.03], 3)
 """(6,) [rad, m]: prior of what the motion within a local map adds to a pose, as PLACE_SIGMAS."""
+_COMMON_SIGMAS = np.repeat([0.0, 0.001 * REACH_M], 3)
+"""(6,) [rad, m] that all maps share: of ranges that are 0.1 % too long."""
 _HOW_TO_JOIN = (
     "or drive 150 m past walls, with times of points, and stamps in the names of clouds or in "
     "times.txt, so that LiDARs are joined by motion"
@@ -58,14 +60,12 @@ class LidarResult:
     """What is found of a rig's LiDARs.
 
     Attributes:
-        lidars: the rig's, with T_base_lidar and its covariance.
         vehicle: the rig's, with T_vehicle_lidar and its sigmas; None if the rig has none.
         poses: of them.
         verdicts: per LiDAR but the base.
         warnings: about the instants and the start, a line each.
     """
 
-    lidars: Mapping[str, Lidar]
     vehicle: Vehicle | None
     poses: LidarPoses
     verdicts: Mapping[str, Verdict]
@@ -104,18 +104,24 @@ def calibrate_rig_lidars(
     progress("locating LiDARs", 0, 1)
     views = _look(instants, guess, rig.lidar)
     start, doubts, lost = locate_lidars(views, guess, base=rig.lidar)
-    parts = [_solve(instants, views, start, base=rig.lidar)] if start else []
+    parts = list[LidarPoses]()
     if lost:
         progress("joining LiDARs by motion", 0, 1)
         far = {name: T for name, T in guess.items() if name not in start}
-        poses, more, line = _join_by_motion(drive, instants, far, lost, base=rig.lidar)
-        parts, doubts, warnings = [*parts, poses], doubts | more, [*warnings, line]
+        known = {name: T for name, T in far.items() if T is not None}
+        try:
+            poses, more, line = _join_by_motion(drive, instants, far, lost, base=rig.lidar)
+            parts, doubts = [poses], doubts | more
+        except CalibrationError:
+            if len(known) < len(far):
+                raise
+            start, line = {**start, **known}, f"{lost}; begun from the guess"
+        warnings.append(line)
+    progress("calibrating LiDARs", 0, 1)
+    if start:
+        parts.append(_solve(instants, views, start, base=rig.lidar))
     poses = join_poses(parts, [rig.lidar, *guess])
     clouds = _at_stamps(instants, poses.T_base_lidar)
-    lidars = {rig.lidar: Lidar()} | {
-        name: Lidar(T_base_lidar=poses.T_base_lidar[name], covariance=poses.covariance[name])
-        for name in rig.other_lidars
-    }
     vehicle = None
     if rig.vehicle is not None:
         progress("finding the vehicle's frame", 0, 1)
@@ -124,7 +130,6 @@ def calibrate_rig_lidars(
     for line in warnings:
         _log.warning(line)
     return LidarResult(
-        {name: lidars[name] for name in rig.lidars or {}},
         vehicle,
         poses,
         {
@@ -164,19 +169,18 @@ def _join_by_motion(
     """The poses of LiDARs that share too little at one time, doubts of them, and a line.
 
     They are calibrated to what the base sees before and after.
+
+    Raises:
+        CalibrationError: if the motion is unknown, or they share too little with that, too.
     """
     maps, at, after = list[View](), list[Instant](), -1
     for instant in instants:
         if instant.frame > after and (found := drive.local_map(instant.frame, base)) is not None:
             after = found[1]
             maps, at = [*maps, found[0]], [*at, instant]
-    known = {name: T for name, T in guess.items() if T is not None}
     if not maps:
-        if len(known) < len(guess):
-            raise CalibrationError(f"{lost}; {_HOW_TO_JOIN}")
-        views = _look(instants, known, base)
-        return _solve(instants, views, known, base=base), {}, f"{lost}; begun from the guess"
-    turned = {name: T for name in guess if name not in known
+        raise CalibrationError(f"{lost}; {_HOW_TO_JOIN}")
+    turned = {name: T for name, given in guess.items() if given is None
               and (T := _turn_by_motion(drive, at, name, maps)) is not None}  # fmt: skip
     near = {**guess, **turned}
     views = {**_look(at, near, base), base: maps}
@@ -186,7 +190,9 @@ def _join_by_motion(
                                f"too: {lost}")  # fmt: skip
     line = (f"{', '.join(guess)} and {base} share too little at one time: joined by motion, at "
             f"{len(maps)} places of what {base} sees {REACH_M:g} m before and after")  # fmt: skip
-    return _solve(at, views, start, base=base, maps=maps), doubts, line
+    poses = _solve(at, views, start, base=base, maps=maps)
+    common = np.diag(np.tile(_COMMON_SIGMAS**2, len(guess)))
+    return replace(poses, joint_covariance=poses.joint_covariance + common), doubts, line
 
 
 def _turn_by_motion(
@@ -215,7 +221,7 @@ def _road(clouds: Mapping[str, Sequence[Array]], poses: LidarPoses) -> Road | No
     """The road by the clouds of all LiDARs together; None if they show none."""
     joined = [
         np.concatenate([
-            cloud[:, :3] @ T[:3, :3].T + T[:3, 3]
+            move_points(cloud, T)
             for cloud, T in zip(at, poses.T_base_lidar.values(), strict=True)
         ])
         for at in zip(*(clouds[name] for name in poses.T_base_lidar), strict=True)

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError
 from calibgraph.matching.cloud_similarity import find_upright
-from calibgraph.model.geometry import invert
+from calibgraph.model.geometry import angle_deg, invert, move_points
 from calibgraph.vehicle.lidars import count_matched, refine_poses
 from calibgraph.vehicle.planes import Planes, View, Views, join_planes
 
@@ -180,13 +180,13 @@ def _correlate(own: _Seen, placed: _Placed, T_up_base: Array) -> tuple[Array, Ar
     """(h,) headings [deg], (c, c, 2) positions of the LiDAR [m], (h, c, c) how well they fit."""
     known, upright = [], []
     for instant, cloud in enumerate(own.clouds):
-        clouds = [_moved(of.clouds[instant], T_up_base @ T) for of, T in placed.values()]
+        clouds = [move_points(of.clouds[instant], T_up_base @ T) for of, T in placed.values()]
         known.append(np.fft.rfft2(_from_above(_upright_points(np.concatenate(clouds)))))
-        upright.append(_upright_points(_moved(cloud, own.T_up_lidar)))
+        upright.append(_upright_points(move_points(cloud, own.T_up_lidar)))
     maps, headings = [], np.arange(0.0, 360.0, _STEP_DEG)
     for heading in headings:
         products = [
-            one * np.fft.rfft2(_from_above(_moved(two, _turn(heading)))).conj()
+            one * np.fft.rfft2(_from_above(move_points(two, _turn(heading)))).conj()
             for one, two in zip(known, upright, strict=True)
         ]
         maps.append(np.fft.irfft2(np.sum(products, axis=0)))
@@ -201,10 +201,6 @@ def _turn(heading_deg: float) -> Array:
     T = np.eye(4)
     T[:3, :3] = Rotation.from_euler("z", heading_deg, degrees=True).as_matrix()
     return T
-
-
-def _moved(points: Array, T: Array) -> Array:
-    return np.asarray(points @ T[:3, :3].T + T[:3, 3])
 
 
 def _upright_points(points_up_m: Array) -> Array:
@@ -257,8 +253,8 @@ def _best(tried: Sequence[_Placement], guess: Array | None) -> tuple[_Placement,
 
 def _apart(T_base_lidar: Array, other: Array) -> tuple[float, float]:
     """How far apart two placements are [deg, m]."""
-    turn = Rotation.from_matrix(T_base_lidar[:3, :3] @ other[:3, :3].T).magnitude()
-    return float(np.degrees(turn)), float(np.linalg.norm(T_base_lidar[:3, 3] - other[:3, 3]))
+    degrees = angle_deg(T_base_lidar[:3, :3] @ other[:3, :3].T)
+    return degrees, float(np.linalg.norm(T_base_lidar[:3, 3] - other[:3, 3]))
 
 
 def _is_other(T_base_lidar: Array, other: Array) -> bool:

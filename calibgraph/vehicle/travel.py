@@ -45,7 +45,6 @@ class Travel:
         pitch_rad: from the x axis down.
         yaw_sigma_rad: standard deviation; infinite if the drive cannot tell.
         pitch_sigma_rad: likewise.
-        straight_m: length of the straight stretches.
         ahead_m: how far the LiDAR is ahead of the rear axle.
         ahead_sigma_m: standard deviation; infinite if the drive cannot tell.
     """
@@ -54,7 +53,6 @@ class Travel:
     pitch_rad: float
     yaw_sigma_rad: float
     pitch_sigma_rad: float
-    straight_m: float
     ahead_m: float = 0.0
     ahead_sigma_m: float = np.inf
 
@@ -113,9 +111,8 @@ def direction_of_travel(T_world_lidar: Array) -> Travel:
     found = np.column_stack([
         np.arctan2(chords[:, 1], chords[:, 0]), np.arctan2(-chords[:, 2], level)
     ])  # fmt: skip
-    straight_m = _STRETCH_M * len(found)
     if len(found) < 2 * _LEAST_PARTS:
-        return Travel(0.0, 0.0, np.inf, np.inf, straight_m)
+        return Travel(0.0, 0.0, np.inf, np.inf)
     parts = np.array_split(found, min(_PARTS, len(found) // 2))
     means = np.array([part.mean(axis=0) for part in parts])
     middle = np.median(found, axis=0)
@@ -123,7 +120,7 @@ def direction_of_travel(T_world_lidar: Array) -> Travel:
     yaw, pitch, yaw_sigma, pitch_sigma = map(float, (*middle, *sigmas))
     ahead = np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), -np.sin(pitch)])
     lever = _lever(every, ahead)
-    return Travel(yaw, pitch, yaw_sigma, pitch_sigma, straight_m, *lever)
+    return Travel(yaw, pitch, yaw_sigma, pitch_sigma, *lever)
 
 
 def _lever(stretches: Array, ahead: Array) -> tuple[float, float]:

@@ -177,22 +177,6 @@ def test_clouds_that_share_nothing_are_refused_with_their_share():
         calibrate_lidars(look(clouds), MOUNTS, base="top")
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"base": "roof"}, "of the base roof and another"),
-        ({"guess": {}}, "no guess of front, left"),
-        ({"less": "left"}, "same instants"),
-    ],
-)
-def test_wrong_arguments_are_named(change, message):
-    clouds = {name: [np.zeros((1, 3))] * 2 for name in MOUNTS}
-    if "less" in change:
-        clouds[change["less"]] = clouds[change["less"]][:1]
-    with pytest.raises(ValueError, match=message):
-        calibrate_lidars(look(clouds), change.get("guess", MOUNTS), base=change.get("base", "top"))
-
-
 def test_the_centre_of_a_plane_lies_on_it_and_single_rings_are_no_planes():
     rng = np.random.default_rng(0)
     cloud = scan(flat_street(), transform(np.eye(3), [0.0, 0.0, 1.8]), rng, noise_m=0.0)

@@ -174,3 +174,21 @@ def test_lidars_that_share_nothing_are_refused_where_the_motion_is_unknown(tmp_p
     message = r"'behind' shares too little with ahead: .*%.* or drive 150 m past walls, with times"
     with pytest.raises(CalibrationError, match=message):
         calibgraph.calibrate(folder)
+
+
+def test_where_lidars_share_the_ground_alone_a_guess_is_begun_from(tmp_path, caplog):
+    rng, nothing = np.random.default_rng(23), np.empty((0, 2, 3))
+    guess = MOUNTS["left"].copy()
+    guess[:3, 3] += [0.03, 0.0, 0.05]
+    for lidar in ("top", "left"):
+        (tmp_path / "lidars" / lidar).mkdir(parents=True)
+        at = transform(np.eye(3), [0.0, 0.0, HEIGHT_M])
+        np.save(tmp_path / "lidars" / lidar / "0", scan(nothing, at @ MOUNTS[lidar], rng))
+    with caplog.at_level(logging.WARNING):
+        result = calibgraph.calibrate(write_rig(tmp_path, "top", {"left": guess}))
+    assert "'left' shares too little with top: 0 upright" in caplog.text
+    assert "; begun from the guess" in caplog.text
+    off = result.T_base_lidar["left"][:3, 3] - MOUNTS["left"][:3, 3]
+    assert np.isclose(off[0], 0.03, atol=1e-3), "along the ground it stays"
+    assert abs(off[2]) < 0.01
+    assert result.verdicts["left"].cannot_tell
