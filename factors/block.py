@@ -276,10 +276,11 @@ class ProjectionBlock(RobustBlock):
             columns = self._columns_at(free, np.zeros(len(free)) if values is None else values)
             moves = free.displacements(columns[:3], columns[4], columns[5:11])
             packed = *free.packed, contiguous(moves)
-        scales = np.array([self.scale]) if scales is None else scales
+        scales = NO_STEP if scales is None else contiguous(scales)
         pass_over(
             lens.kind, lens.packed, T_camera_lidar, columns, wanted, out,
-            whitening=self._whitening, scales=scales, sigma=self.sigma, free=packed, **rest,
+            whitening=self._whitening, scale=float(self.scale), scales=scales,
+            sigma=float(self.sigma), free=packed, **rest,
         )  # fmt: skip
 
     def _columns_at(self, free: Columns, values: Array) -> Array:

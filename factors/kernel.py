@@ -70,7 +70,7 @@ WIDTH = 2 * TILE + 8
 
 NO_STEP = read_only(np.empty(0))
 NO_FREE = read_only(np.empty(0, np.int64)), NO_STEP, read_only(np.empty((0, 3, 0)))
-_NO_WHITENING, _ONE = read_only(np.empty((0, 0))), read_only(np.ones(1))
+_NO_WHITENING = read_only(np.empty((0, 0)))
 _NO_POSES, _NO_FLAGS = np.empty((0, 4, 4)), np.empty(0, np.bool_)
 _SMALL = 1e-100  # far from the smallest float by more than four factors
 
@@ -85,7 +85,8 @@ def pass_over(  # noqa: PLR0913 - the arguments of the kernel
     *,
     runs: NDArray[np.int64] | None = None,
     whitening: Array = _NO_WHITENING,
-    scales: Array = _ONE,
+    scale: float = 1.0,
+    scales: Array = NO_STEP,
     sigma: float = 1.0,
     free: tuple[NDArray[np.int64], Array, Array] = NO_FREE,
     step: Array = NO_STEP,
@@ -110,8 +111,9 @@ def pass_over(  # noqa: PLR0913 - the arguments of the kernel
         runs: first correspondence, and the one behind the last; None: one run. Of residuals and
             norms, they hold every point once.
         whitening: (3, n) triangular matrices, (1, n) numbers, or (0, n).
-        scales: (r,) of the loss of each run, or (1,).
-        sigma: what whitened residuals are divided by; scales are multiples of it.
+        scale: of the loss, a multiple of sigma.
+        scales: (r,) of each run, in its place; or empty.
+        sigma: what whitened residuals are divided by.
         free: (k,) columns beside the pose, (k,) their units, and (m, 3, n) the displacements of the
             points in the LiDAR frame by those that displace them.
         step: (6 + k,) displaces the residuals by so much of the columns; or empty.
@@ -126,7 +128,7 @@ def pass_over(  # noqa: PLR0913 - the arguments of the kernel
         runs = np.array([[0, columns.shape[1]]])
     numbers, units, moves = free
     _kernel(kind)(
-        lens, contiguous(T_camera_lidar), columns, whitening, contiguous(runs), contiguous(scales),
+        lens, contiguous(T_camera_lidar), columns, whitening, contiguous(runs), scale, scales,
         sigma, numbers, units, moves, step, wanted, factor, tolerance,
         out.reshape((1,) * (4 - out.ndim) + out.shape), moved, flags,
     )  # fmt: skip
@@ -136,8 +138,8 @@ def pass_over(  # noqa: PLR0913 - the arguments of the kernel
 def _kernel(kind: int) -> Any:
     @compiled(fastmath=FAST)
     def pass_over_runs(  # type: ignore[no-untyped-def]
-        lens, poses, columns, whitening, runs, scales, sigma, free, units, moves, step, wanted,
-        factor, tolerance, out, moved, flags,
+        lens, poses, columns, whitening, runs, scale, scales, sigma, free, units, moves, step,
+        wanted, factor, tolerance, out, moved, flags,
     ):  # fmt: skip
         """See ``pass_over``; ``out`` has four axes."""
         size = 7 + len(free)
@@ -147,7 +149,7 @@ def _kernel(kind: int) -> Any:
         has_rays = has_rays and (wanted < COLUMNS or (COST <= wanted <= PRODUCTS and size == 7))  # noqa: PLR2004
         for run in range(len(runs)):
             best, new, damping = -1, 0, DAMPING
-            scale = sigma * scales[run if len(scales) > 1 else 0]
+            width = sigma * (scales[run] if len(scales) else scale)
             copy(poses[run if len(poses) > 1 else 0], tried[0])
             for _ in range(1 + MAX_STEPS if len(moved) else 1):
                 T, found = tried[new], out[run if wanted >= COST else 0, 0]
@@ -175,7 +177,7 @@ def _kernel(kind: int) -> Any:
                             fill_norms(whitening, start, n, tile, factor, flags, out[0, 0])
                         continue
                     if as_rays:
-                        add_rays(lens, whitening, scale, start, n, wanted, tile, found)
+                        add_rays(lens, whitening, width, start, n, wanted, tile, found)
                         continue
                     fill_rows(n, tile, rows)
                     if len(free):
@@ -195,9 +197,9 @@ def _kernel(kind: int) -> Any:
                         for i in range(2 * n):
                             residuals[i] += step[k] * rows[k, i]
                     psi = tile[PSI]
-                    found[size, 0] += weigh(scale, n, residuals, residuals[n:], psi)
+                    found[size, 0] += weigh(width, n, residuals, residuals[n:], psi)
                     if wanted == CURVATURE:
-                        fill_bends(scale, n, psi, rows, bends)
+                        fill_bends(width, n, psi, rows, bends)
                         add_products(n, bends, out[run, 1])
                     if wanted != COST:
                         add_weighted(n, psi, rows, found)

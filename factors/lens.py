@@ -40,7 +40,7 @@ ORDERS: dict[LensModel, str] = {
 """The distortion coefficients of each model in their order, which is OpenCV's."""
 _IDENTITY = np.eye(4)[None]
 _MAX_PLANE_RADIUS = math.tan(math.radians(85.0))  # polynomials are not fitted beyond
-_TABLE, _MOST_AHEAD = 500, math.radians(89.9)
+_TABLE = 500
 _MAX_XI = 100.0  # beyond, the model is a parallel projection, whose focal length is not determined
 _ITERATIONS = 20  # of Newton; 3 to 6 are enough but near the limit of a lens
 _CONVERGED_PX = 1e-10
@@ -249,14 +249,16 @@ def _right_inverse(jacobians: Array) -> Array:
 
 
 def _first_rays(lens: Lens, pixels: Array) -> Array:
-    """(n, 3) rays by a table of the radius over the angle, as if there were no tangential terms."""
-    fx, fy, cx, cy = lens.packed[:4]
+    """(n, 3) rays without tangential distortion; of a pinhole, without any."""
+    (fx, fy, cx, cy), limit = lens.packed[:4], lens.packed[LIMIT]
     plane = np.column_stack([(pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy])
-    limit = lens.packed[LIMIT]
-    angle = np.linspace(0.0, math.atan(limit) if lens.kind == PINHOLE else limit, _TABLE)
-    angle = np.minimum(angle, _MOST_AHEAD if lens.kind == PINHOLE else math.inf)
-    along = lens.project(np.column_stack([np.sin(angle), np.zeros(_TABLE), np.cos(angle)]))[0]
-    radius = np.hypot(*plane.T)
-    found = np.interp(radius, np.maximum.accumulate((along[:, 0] - cx) / fx), angle)
-    sideways = np.sin(found) / np.maximum(radius, np.finfo(float).tiny)
-    return np.column_stack([plane * sideways[:, None], np.cos(found)])
+    radius = np.maximum(np.hypot(*plane.T), np.finfo(float).tiny)
+    if lens.kind == PINHOLE:
+        inside = np.minimum(1.0, limit / radius)
+        rays = np.column_stack([plane * inside[:, None], np.ones(len(plane))])
+        return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+    angles = np.linspace(0.0, limit, _TABLE)
+    along = np.column_stack([np.sin(angles), np.zeros(_TABLE), np.cos(angles)])
+    distances = np.maximum.accumulate((lens.project(along)[0][:, 0] - cx) / fx)
+    angle = np.interp(radius, distances, angles)
+    return np.column_stack([plane * (np.sin(angle) / radius)[:, None], np.cos(angle)])

@@ -133,6 +133,8 @@ def _derive(folder: Path, first: Path, still: ScanErrors, case: Key) -> None:
     """The images of the street that is rendered, with other clouds."""
     if case.kind == "timed":
         folder.mkdir()
+        if not (triggered := folder.with_name("triggered")).exists():
+            _derive(triggered, first, still, replace(case, kind="triggered"))
         for name in ("cameras", "lidar"):
             (folder / name).symlink_to(f"../triggered/{name}")
         return

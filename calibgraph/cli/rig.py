@@ -18,7 +18,6 @@ from calibgraph.io.formats import IMPORT_FORMATS
 
 if TYPE_CHECKING:
     from calibgraph.guessing.guess import RigGuess
-    from calibgraph.io.rig_parts import RigParts
     from calibgraph.model.rig import Rig
 
 _TAKEN = {
@@ -85,7 +84,6 @@ def rig(
     """
     from calibgraph.files import require_new_file
     from calibgraph.io.bags.storage import is_bag
-    from calibgraph.io.formats.rig_import import read_rig_parts
     from calibgraph.io.rigs import describe_rig
     from calibgraph.model.lens import state_calibrated
     from calibgraph.model.plausibility import find_implausible
@@ -109,16 +107,11 @@ def rig(
             made, notes, topics = _rig_of_bags([*map(Path, source)], topic)
             guess = None
         else:
-            named = [_parse_file(text) for text in source]
-            parts = read_rig_parts(
-                [file for _, file in named], names={file: name for name, file in named if name},
-                rename=parse_names("--rename", rename), lidar_frame=lidar_frame,
+            topics = list[dict[str, Any]]()
+            made, notes, guess = _rig_of_files(
+                source, mount, forward=forward, size_px=_size_px(size), lidar_frame=lidar_frame,
+                rename=parse_names("--rename", rename),
                 camera_frames=parse_names("--camera-frame", camera_frame),
-            )  # fmt: skip
-            notes, topics = [f"note: {note}" for note in parts.notes], []
-            made, guess = _rig_of_files(
-                parts, parse_names("--mount", mount), forward=forward,
-                size_px=_size_px(size),
             )  # fmt: skip
         made = state_calibrated(correct_guess(made, correct or ()))
         guess = guess and replace(guess, rig=made)
@@ -131,7 +124,11 @@ def rig(
         print_json(found | written | (guess.to_mapping() if guess else {}))
         return
     lines = [f"{each['topic']}  {each['type']}  {each['messages']}" for each in topics]
-    for line in [*lines, *(guess.lines if guess else describe_rig(made)), *notes]:
+    _print_rig([*lines, *(guess.lines if guess else describe_rig(made)), *notes], out)
+
+
+def _print_rig(lines: list[str], out: Path | None) -> None:
+    for line in lines:
         print_line(line)
     end = f"{out}: written" if out is not None else "nothing was written; --out writes the rig"
     print_line(f"{end}; check the sentences above against the vehicle")
@@ -168,20 +165,25 @@ def _size_px(size: str | None) -> tuple[int, int] | None:
 
 
 def _rig_of_files(
-    parts: RigParts,
-    mountings: dict[str, str],
+    source: list[str], mount: list[str] | None, *, forward: str, size_px: tuple[int, int] | None,
     **options: Any,
-) -> tuple[Rig, RigGuess | None]:
-    """The rig, and how good its guess is, where cameras are described.
+) -> tuple[Rig, list[str], RigGuess | None]:  # fmt: skip
+    """The rig, notes on it, and how good its guess is, where cameras are described.
 
-    The options are those of :func:`guess_rig`.
+    The other options are those of :func:`read_rig_parts`.
     """
     from calibgraph.guessing.guess import guess_rig
+    from calibgraph.io.formats.rig_import import read_rig_parts
 
+    named, mountings = [_parse_file(text) for text in source], parse_names("--mount", mount)
+    parts = read_rig_parts(
+        [file for _, file in named], names={file: name for name, file in named if name}, **options
+    )
+    notes = [f"note: {note}" for note in parts.notes]
     if not mountings:
-        return parts.to_rig(size_px=options["size_px"]), None
-    guess = guess_rig(parts, mountings=mountings, **options)
-    return guess.rig, guess
+        return parts.to_rig(size_px=size_px), notes, None
+    guess = guess_rig(parts, mountings=mountings, forward=forward, size_px=size_px)
+    return guess.rig, notes, guess
 
 
 def _rig_of_bags(

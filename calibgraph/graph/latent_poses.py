@@ -155,8 +155,8 @@ class LatentPoseModel:
         components: of the errors.
         of: the poses that are reported.
         lenses: those that are estimated, by the numbers of their cameras.
-        lens_errors: by the numbers of cameras, (6, 6) covariance of what is reported by what is
-            considered of lens and clock.
+        considered: (6 N, 6 N) covariance of what is reported by what is considered of lens and
+            clock.
         frames: the numbers of the frames of each place.
     """
 
@@ -167,7 +167,7 @@ class LatentPoseModel:
     components: VarianceComponents
     of: Reported = "alignment"
     lenses: Mapping[int, LensTerm] = field(default_factory=dict)
-    lens_errors: Mapping[int, Array] = field(default_factory=dict)
+    considered: Array = field(default_factory=lambda: np.zeros((0, 0)))
     frames: Sequence[NDArray[np.int64]] = ()
 
     @property

@@ -300,8 +300,9 @@ def _summary(
 ) -> str:
     """How many frames there are, how far apart their stamps are, and what was left out."""
     clouds = stamps[topics.lidar]
+    kinds = ["images"] * bool(topics.images) + ["clouds of other LiDARs"] * bool(topics.lidars)
     parts = [
-        f"{len(clouds.paths)} clouds, {len(complete)} with all {_paired(topics)} within "
+        f"{len(clouds.paths)} clouds, {len(complete)} with all {' and '.join(kinds)} within "
         f"{options.sync_tolerance_s:g} s"
     ]
     for name, rows in pairs.items():
@@ -319,11 +320,6 @@ def _summary(
         for what, count in each.left_out.items()
     ]
     return "; ".join(parts)
-
-
-def _paired(topics: RigTopics) -> str:
-    kinds = ["images"] * bool(topics.images) + ["clouds of other LiDARs"] * bool(topics.lidars)
-    return " and ".join(kinds)
 
 
 def _advice(stamps: Mapping[str, TopicStamps], topics: RigTopics, pairs: Mapping[str, Rows]) -> str:

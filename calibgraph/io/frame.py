@@ -200,9 +200,8 @@ class Frame:
             found = with_intensity(load_bag_cloud(path, motion.correct if motion else None))
         else:
             found = self.arrays[path] if path in self.arrays else load_cloud(path, self.columns)
-            times_s = None if motion is None else self.load_recorded("", timed=True)[1]
-            if motion is not None and times_s is not None:
-                found[:, :3] = motion.correct(found[:, :3], times_s)
+            if motion is not None and (sweep := self.load_sweep()) is not None:
+                found[:, :3] = motion.correct(*sweep)
         return thin_cloud(found)
 
     def load_recorded(self, lidar: str, *, timed: bool) -> tuple[Array, Array | None]:
@@ -221,11 +220,11 @@ class Frame:
         return cloud[:, :3].astype(np.float64), times_s
 
     def load_sweep(self) -> tuple[Array, Array] | None:
-        """(n, 3) the points and (n,) their times [s] after the stamp; None of one instant.
+        """(n, 3) the points as recorded, and (n,) their times [s] after the stamp; None without.
 
-        That is of a cloud that is corrected for motion, or whose points have no times.
+        Times that are all equal, or of no scan, are none.
         """
-        if self.find_motion or self.cloud_path in self.arrays:
+        if self.cloud_path in self.arrays:
             return None
         with suppress(DatasetError):  # numbers that are no times of one scan
             points, times_s = self.load_recorded("", timed=True)

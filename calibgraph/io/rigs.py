@@ -118,11 +118,9 @@ def find_rig_file(path: Path | str) -> Path | None:
     folder = Path(path)
     if not folder.is_dir() or is_bag(folder) or published_folder(folder):
         return folder
-    names = (CALIBRATION_FILE, RIG_FILE)
-    if (folder / "lidar").is_dir() or (
-        folder / LIDARS
-    ).is_dir():  # a dataset, which may have a result written into it
-        names = (RIG_FILE, CALIBRATION_FILE)
+    names = [CALIBRATION_FILE, RIG_FILE]
+    if any((folder / clouds).is_dir() for clouds in ("lidar", LIDARS)):
+        names.reverse()  # a dataset may have a result written into it
     paths = (folder / name for name in (*names, CALIBRATION_NAME))
     return next((path for path in paths if path.is_file()), None)
 

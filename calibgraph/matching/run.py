@@ -115,7 +115,8 @@ def with_delays(table: Correspondences, data: Dataset) -> Correspondences:
     It is zero in frames during which the vehicle stands. Images of unknown times count as taken in
     the middle of the sweep.
     """
-    if not len(table) or data.frames[0].load_sweep() is None:
+    first = data.frames[0]
+    if not len(table) or first.find_motion or first.load_sweep() is None:
         return table
     late_s, stands = np.zeros(len(table)), {n for stop in table.places.stationary for n in stop}
     for frame in data.frames:

@@ -3,13 +3,15 @@
 import sqlite3
 import threading
 import time
-from dataclasses import dataclass, fields
+from datetime import datetime
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
 
 from calibgraph.child_process import ErrorKind, Outcome
 from calibgraph.errors import CalibrationError
-from calibgraph.service.requests import Job, JobKind
+from calibgraph.service.requests import Job, JobKind, JobProgress
 
 JobState = Literal["queued", "running", "succeeded", "failed", "cancelled"]
 FINISHED: tuple[JobState, ...] = ("succeeded", "failed", "cancelled")
@@ -31,24 +33,36 @@ CREATE INDEX IF NOT EXISTS calibgraph_jobs_by_state ON calibgraph_jobs (state, n
 """
 
 
-@dataclass(frozen=True)
-class JobRecord:
-    """A job; times are seconds since 1970, None if not yet."""
+class JobRecord(BaseModel):
+    """A job, as it is answered but for what is of the table alone.
 
-    number: int
+    Attributes:
+        number, request, starts: in the table; how often it was started.
+        created, started, finished: times (UTC); null if not yet.
+        progress: of a running job.
+        verdict: of the result: PASS, WARN or FAIL; of a check OK, WRONG or CANNOT TELL.
+        cannot_tell: whether the data determine too little for another verdict.
+        error_kind, error: why it failed: bad input, io, out of memory, timeout, worker died or
+            internal error; and in one line what to do.
+    """
+
+    model_config = ConfigDict(frozen=True)
+
+    number: Annotated[int, Field(exclude=True)]
     id: str
     kind: JobKind
     state: JobState
-    request: str
+    request: Annotated[str, Field(exclude=True)]
     name: str
-    created_s: float
-    started_s: float | None
-    finished_s: float | None
-    starts: int
+    created: datetime
+    started: datetime | None
+    finished: datetime | None
+    starts: Annotated[int, Field(exclude=True)]
     verdict: str | None
     cannot_tell: bool | None
     error_kind: ErrorKind | None
     error: str | None
+    progress: JobProgress | None = None
 
     @property
     def is_finished(self) -> bool:
@@ -56,7 +70,10 @@ class JobRecord:
         return self.state in FINISHED
 
 
-_COLUMNS = ", ".join(each.name for each in fields(JobRecord))
+_COLUMNS = (
+    "number, id, kind, state, request, name, created_s AS created, started_s AS started, "
+    "finished_s AS finished, starts, verdict, cannot_tell, error_kind, error"
+)
 
 
 class JobTable:
@@ -75,6 +92,7 @@ class JobTable:
             self._connection = sqlite3.connect(
                 path, _WAIT_S, check_same_thread=False, isolation_level=None
             )
+            self._connection.row_factory = sqlite3.Row
             self._connection.executescript(_SCHEMA)
         except sqlite3.Error as error:
             raise CalibrationError(f"{path}: cannot be opened ({error}); move it away") from error
@@ -95,7 +113,7 @@ class JobTable:
             f"VALUES (:id, :kind, 'queued', :request, :name, :now, 0) RETURNING {_COLUMNS}",
             id=id, kind=job.kind, request=job.model_dump_json(), name=job.name, now=time.time(),
         )  # fmt: skip
-        return JobRecord(*row)
+        return JobRecord(**row)
 
     def get(self, id: str) -> JobRecord | None:
         """A job; None if there is none."""
@@ -109,7 +127,7 @@ class JobTable:
 
     def _select(self, where: str, **values: Any) -> list[JobRecord]:
         rows = self.run(f"SELECT {_COLUMNS} FROM calibgraph_jobs {where}", **values)
-        return [JobRecord(*row) for row in rows]
+        return [JobRecord(**row) for row in rows]
 
     def counts(self) -> dict[JobState, int]:
         """How many jobs are in each state."""
@@ -122,7 +140,7 @@ class JobTable:
             "WHERE number = (SELECT min(number) FROM calibgraph_jobs WHERE state = 'queued') "
             f"RETURNING {_COLUMNS}", now=time.time()
         )  # fmt: skip
-        return JobRecord(*rows[0]) if rows else None
+        return JobRecord(**rows[0]) if rows else None
 
     def finish(self, id: str, outcome: Outcome) -> None:
         """Give a running job its final state, unless it was cancelled."""

@@ -2,20 +2,19 @@
 
 import asyncio
 import time
-from datetime import datetime
 from typing import Annotated, Literal
 
 from fastapi import APIRouter, Depends, Query, Request
 from fastapi.responses import FileResponse, HTMLResponse, PlainTextResponse, Response
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+from pydantic import BaseModel, StringConstraints
 from starlette.concurrency import run_in_threadpool
 
 from calibgraph.model.result_files import REPORT_FILE
 from calibgraph.report.kit import page_template
 from calibgraph.service.folders import ARCHIVE, FILES, LOG, RESULT, SUMMARY
-from calibgraph.service.jobs import JobRecord, JobState
+from calibgraph.service.jobs import JobRecord
 from calibgraph.service.problems import Problem
-from calibgraph.service.requests import RECORDING, RIG, TABLE, TEXTS, JobKind, JobProgress
+from calibgraph.service.requests import RECORDING, RIG, TABLE, TEXTS, JobKind
 from calibgraph.service.state import Service, service_of
 from calibgraph.service.uploads import receive_job
 
@@ -35,43 +34,15 @@ _LONGEST_PAUSE_S = 0.5
 _MOST_LOG = 2**20
 
 
-class JobAnswer(BaseModel):
-    """A job.
-
-    Attributes:
-        created, started, finished: times (UTC); null if not yet.
-        verdict: of the result: PASS, WARN or FAIL; of a check OK, WRONG or CANNOT TELL.
-        cannot_tell: whether the data determine too little for another verdict.
-        error_kind, error: why it failed: bad input, io, out of memory, timeout, worker died or
-            internal error; and in one line what to do.
-    """
-
-    model_config = ConfigDict(from_attributes=True)
-
-    id: str
-    kind: JobKind
-    state: JobState
-    name: str
-    created: Annotated[datetime, Field(validation_alias="created_s")]
-    started: Annotated[datetime | None, Field(validation_alias="started_s")]
-    finished: Annotated[datetime | None, Field(validation_alias="finished_s")]
-    progress: JobProgress | None = None
-    verdict: str | None
-    cannot_tell: bool | None
-    error_kind: str | None
-    error: str | None
-
-
 class JobList(BaseModel):
     """Jobs, the newest first; ``next`` is ``before`` of the next page, null on the last."""
 
-    jobs: list[JobAnswer]
+    jobs: list[JobRecord]
     next: int | None
 
 
-def _answer(record: JobRecord, state: Service) -> JobAnswer:
-    progress = {"progress": state.runner.steps.get(record.id)}
-    return JobAnswer.model_validate(record).model_copy(update=progress)
+def _answer(record: JobRecord, state: Service) -> JobRecord:
+    return record.model_copy(update={"progress": state.runner.steps.get(record.id)})
 
 
 _FILE = {"type": "string", "format": "binary"}
@@ -84,7 +55,7 @@ _FORM = {"type": "object", "properties": _PARTS | dict.fromkeys(TEXTS, {"type": 
     status_code=202,
     openapi_extra={"requestBody": {"content": {"multipart/form-data": {"schema": _FORM}}}},
 )
-async def submit(kind: JobKind, request: Request, response: Response, state: State) -> JobAnswer:
+async def submit(kind: JobKind, request: Request, response: Response, state: State) -> JobRecord:
     """Ask for a job: a form with files, and settings as JSON."""
     size = int(request.headers.get("content-length", "0"))
     await run_in_threadpool(state.require_room, size)
@@ -116,7 +87,7 @@ def _found(state: Service, id: str) -> JobRecord:
 @router.get("/v1/jobs/{id}")
 async def get_job(
     id: str, state: State, wait_s: Annotated[float, Query(ge=0, le=_LONGEST_WAIT_S)] = 0.0
-) -> JobAnswer:
+) -> JobRecord:
     """A job; with ``wait_s`` the answer waits until it is finished, not longer than that."""
     start = time.monotonic()
     while True:
@@ -129,7 +100,7 @@ async def get_job(
 
 
 @router.delete("/v1/jobs/{id}")
-def cancel_job(id: str, state: State) -> JobAnswer:
+def cancel_job(id: str, state: State) -> JobRecord:
     """Cancel a job that waits or runs."""
     _found(state, id)
     if not state.runner.cancel(id):

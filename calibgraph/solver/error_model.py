@@ -199,25 +199,20 @@ def error_model(
     blocks: dict[str, BlockByPlace] = {}
     shown, lenses = {}, {}
     for name, block in inliers.blocks.items():
-        by_place = block_by_place(block, at.scales[name], places)
-        within = within_place(at, name, by_place)
-        block_of_graph = by_place.block.with_variance(within.least)
-        placed, evidence = replace(by_place, block=block_of_graph), None
-        lens, number = inliers.lenses.get(name), cameras.index(name)
+        placed, T = block_by_place(block, at.scales[name], places), at.T_camera_lidar[name]
+        within, lens, evidence = within_place(at, name, placed), inliers.lenses.get(name), None
         if any(findings.bend_sigmas):
-            weak, T = weak_information(lens), at.T_camera_lidar[name]
+            weak = weak_information(lens)
             evidence = distortion_evidence(
                 block, at.scales[name], T, weak, places=places, lens=lens
             )
-        blocks[name] = placed
-        if lens is not None:
-            term = lens_term(lens, by_place, within, at.T_camera_lidar[name], findings=findings)
-            if evidence is not None:
-                bent = evidence.lens_jacobian * np.asarray(findings.bend_sigmas)
-                term = replace(term, by_distortion=bent)
-            lenses[number] = term
-            blocks[name] = replace(placed, free=lens.free)
         shown[name] = within, evidence
+        left, free = placed.block.with_variance(within.least), None if lens is None else lens.free
+        blocks[name] = replace(placed, block=left, free=free)
+        if lens is not None:
+            lenses[cameras.index(name)] = lens_term(
+                lens, placed, within, T, evidence=evidence, findings=findings
+            )
     pairs = [pair for pair in inliers.pairs if len(pair.frame)]  # the gate may leave none
     rigid = common_error(findings.rigid_sigmas, findings.camera_share)
     if not any(findings.systematic_sigmas) and inliers.pairs:  # nothing is stated

@@ -24,6 +24,7 @@ from calibgraph.model.findings import MatcherFindings, error_components
 from calibgraph.model.geometry import pose_rows, to_T_camera_lidar, to_T_lidar_camera
 from calibgraph.model.lens import LensEstimate, LensSigmas
 from calibgraph.model.rig import Camera, Rig
+from calibgraph.solver.columns import DistortionEvidence
 from calibgraph.solver.covariance import FittedObjective, positive_part
 from calibgraph.solver.places import ErrorFit
 from calibgraph.solver.within_place import WEAK, WithinPlace
@@ -65,15 +66,17 @@ def lens_term(
     within: WithinPlace,
     T_camera_lidar: Array,
     *,
+    evidence: DistortionEvidence | None,
     findings: MatcherFindings,
 ) -> LensTerm:
-    """The lens of a camera in the error model, without scan distortion.
+    """The lens of a camera in the error model.
 
     Args:
         lens: of the camera.
         placed: its matches.
         within: what its matches of one place share.
         T_camera_lidar: (4, 4) the minimum for independent matches.
+        evidence: of the scan distortion, if there is one.
         findings: the matcher's error.
     """
     hessians, gradients = _by_place_at_minimum(lens, placed, T_camera_lidar)
@@ -89,9 +92,11 @@ def lens_term(
     shared = within.efficiency * max(findings.place_variance * within.alike, of_matches)
     whole = within.efficiency**2 * (covariance @ scatter @ covariance) + shared * covariance
     excess = positive_part((whole - in_graph)[6:, 6:])
-    return LensTerm(
-        lens, excess, np.zeros((len(excess), 0)), -np.linalg.solve(hessian[:6, :6], hessian[:6, 6:])
-    )
+    bent = np.zeros((len(excess), 0))
+    if evidence is not None:
+        bent = evidence.lens_jacobian * np.asarray(findings.bend_sigmas)
+    follow = -np.linalg.solve(hessian[:6, :6], hessian[:6, 6:])
+    return LensTerm(lens, excess, bent, follow)
 
 
 def _by_place_at_minimum(
@@ -115,9 +120,9 @@ def _by_place_at_minimum(
     return np.add.reduceat(sums.hessian, np.searchsorted(place, placed.places)), sums.gradient
 
 
-def lens_errors(at: FittedObjective) -> dict[int, Array]:
-    """Per number of a camera, (6, 6) covariance of its pose by what may err of its lens."""
-    found = {}
+def lens_errors(at: FittedObjective) -> Array:
+    """(6 N, 6 N) covariance of all poses by what may err of their lenses."""
+    found = np.zeros((6 * len(at.cameras), 6 * len(at.cameras)))
     for name, block in at.projections.items():
         lens, T = considered_lens(at.objective.rig.cameras[name], block), at.T_camera_lidar[name]
         block = block.select(np.arange(0, len(block), -(-len(block) // _SAMPLE)))  # noqa: PLW2901
@@ -125,7 +130,8 @@ def lens_errors(at: FittedObjective) -> dict[int, Array]:
         columns = lens_columns(lens, block, T)
         own = error_by_lens(lens, columns, block, T, of=at.objective.config.of, estimated=estimated)
         if own is not None:
-            found[at.cameras.index(name)] = own
+            rows = pose_rows(at.cameras.index(name))
+            found[rows, rows] = own
     return found
 
 

@@ -157,8 +157,8 @@ class CameraBlock:
         the other, and their gradients with them. The term is some percent of the Hessian, and
         negative. It is measured on the matches near the edge, on both sides of it.
         """
-        T = T_camera_lidar[None]
-        errors, whitened = (b.run_norms(T)[-1] for b in (self._constrained, self.block))
+        T, medians = T_camera_lidar[None], median_norm(self.information)
+        errors, whitened = (sizes * medians for sizes in self.all_sizes(T))
         near = np.abs(errors - scale.gate_px) < _GATE_BAND * scale.gate_px
         edge = self.select(near)
         across = error_gradient(edge.block.residuals(T)[0], errors[near], edge.information)

@@ -42,7 +42,6 @@ from calibgraph.graph.variables import (
 from calibgraph.model.geometry import (
     adjoints,
     invert_each,
-    pose_rows,
     retract_all,
     to_T_lidar_camera,
 )
@@ -414,14 +413,11 @@ class ErrorFit:
         """(6 N, n) derivative of all reported poses by the shared variables, in their tangents."""
         return self._reported[1]
 
-    @cached_property
+    @property
     def by_lenses(self) -> Array:
         """(6 N, 6 N) covariance of the reported poses by what is considered of their lenses."""
-        size = 6 * len(self.model.cameras)
-        found, considered = np.zeros((size, size)), self.model.lens_errors
-        for number, own in ({} if self.is_of_mount else considered).items():
-            found[pose_rows(number), pose_rows(number)] = own
-        return found
+        considered = self.model.considered
+        return np.zeros_like(considered) if self.is_of_mount else considered
 
     @cached_property
     def covariance(self) -> Array:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import accumulate, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,12 +108,12 @@ def _spreads(
     values: Array, runs: NDArray[np.int64], start: tuple[float, float], rounds: int
 ) -> Array:
     """(r,) see :func:`_fill_spreads`."""
-    edges, found = np.zeros(len(runs) + 1, np.int64), np.empty(len(runs))
-    np.cumsum(runs[:, 1] - runs[:, 0], out=edges[1:])
-    ordered = np.concatenate([values[first:end] for first, end in runs.tolist()] or [values[:0]])
-    for first, end in pairwise(edges.tolist()):
+    parts, found = [values[first:end] for first, end in runs.tolist()], np.empty(len(runs))
+    edges = [*accumulate(map(len, parts), initial=0)]
+    ordered = np.concatenate([*parts, values[:0]])
+    for first, end in pairwise(edges):
         ordered[first:end].sort()
-    _fill_spreads(contiguous(ordered), contiguous(edges), start, rounds, found)
+    _fill_spreads(contiguous(ordered), contiguous(np.array(edges)), start, rounds, found)
     return found
 
 

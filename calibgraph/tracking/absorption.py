@@ -246,9 +246,8 @@ def _wait_longer(state: State, camera: int, reasons: tuple[str, ...]) -> None:
 
 def _start_camera(state: State, camera: int, T_camera_lidar: Array) -> None:
     """Absorb a camera's first frames at its first estimate."""
-    found = [_camera_block(state, camera, table) for table in state.waiting[camera]]
-    usable = [block for block in found if block is not None]
-    raw = merge(usable)
+    kept = preprocess(state.rig, concatenate(state.waiting[camera]), state.config)
+    raw = camera_blocks(state.rig, kept.table, state.config)[state.names[camera]]
     scale = raw.scale(T_camera_lidar, state.config)
     gated = Gated.at(T_camera_lidar, raw, scale)
     state.put(
@@ -257,7 +256,7 @@ def _start_camera(state: State, camera: int, T_camera_lidar: Array) -> None:
         scales=scale, share=gated.usual_share, curvature=gated.curvature(scale),
     )  # fmt: skip
     _consider_lens(state, camera, raw.select(gated.inliers))
-    absorb_again(state, camera, usable, T_camera_lidar)
+    absorb_again(state, camera, [raw], T_camera_lidar)
 
 
 def count_epoch(state: State, camera: int, first: int) -> None:
@@ -327,9 +326,3 @@ def absorb_again(
     kept = None if own is None else own[0].select(own[1])  # follow the distortion in another way
     bends[:54] = _bends_of(state, camera, kept)[:54] if kept else 0.0
     state.put(camera, bends=bends)
-
-
-def _camera_block(state: State, camera: int, table: Correspondences) -> CameraBlock | None:
-    """The preprocessed matches of one camera's frame, None if there are too few."""
-    kept = preprocess(state.rig, table, state.config)
-    return camera_blocks(state.rig, kept.table, state.config).get(state.names[camera])

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
@@ -20,7 +21,6 @@ from calibgraph.graph.latent_poses import LatentPoseModel
 from calibgraph.graph.objective import objective_graph
 from calibgraph.model.findings import error_components
 from calibgraph.model.geometry import retract_all
-from calibgraph.model.rig import RelativePose
 from calibgraph.solver.components import (
     Component,
     Evidence,
@@ -48,8 +48,7 @@ _ROUNDS = 2  # of estimates of the variance ratios, a fit after each
 _OPEN_WEIGHINGS, _MOST_WEIGHINGS, _SAME_WEIGHT = 2, 20, 1e-2
 
 
-@dataclass(frozen=True, eq=False)
-class Spread:
+class Spread(NamedTuple):
     """What the frames of each camera show of their errors, as ``calibgraph.solver.within_place``.
 
     Attributes:
@@ -62,22 +61,6 @@ class Spread:
     excess: Array
     efficiency: Array
 
-    @staticmethod
-    def unknown(cameras: int) -> Spread:
-        """Of independent matches."""
-        excess = np.tile(1e-3 * np.eye(6), (cameras, 1, 1))
-        return Spread(np.ones(cameras), excess, np.ones(cameras))
-
-    def mean_variance(self, place_variance: float, alike: Array) -> Array:
-        """(n,) of all matches of a camera, in units of independent ones, in the mean over a pose.
-
-        Args:
-            place_variance: of the matcher.
-            alike: (n,) frames of a place.
-        """
-        within = self.least + np.trace(self.excess, axis1=1, axis2=2) / 6
-        return np.asarray(within + place_variance * self.efficiency * alike)
-
 
 def spread_of(state: State, sums: PlaceSums) -> Spread:
     """What the frames of each camera show of their errors, about the means of their places.
@@ -87,8 +70,8 @@ def spread_of(state: State, sums: PlaceSums) -> Spread:
     """
     (scatter, left), every = sums.within_places, sums.rows.total()
     hessian, reweighted, frames = every.hessian, every.reweighted, every.frames
-    blank = Spread.unknown(len(frames))
-    least, excess, efficiency = blank.least, blank.excess, blank.efficiency
+    n = len(frames)  # of those without any, as of independent matches
+    least, excess, efficiency = np.ones(n), np.tile(1e-3 * np.eye(6), (n, 1, 1)), np.ones(n)
     for camera in map(int, np.flatnonzero(frames)):
         own = scatter[camera]
         if not states_places(state) and state.scatter_of_frames(camera) is not None:
@@ -390,7 +373,8 @@ class EpochGraph:
         if any(findings.bend_sigmas):
             hessian, pulled = bends[:, :36].reshape(-1, 6, 6), bends[:, 36:54].reshape(-1, 6, size)
             jacobian = np.linalg.solve(hessian + WEAK, pulled) * sigmas
-            weight = 1.0 / spread.mean_variance(findings.place_variance, sums.alike)
+            within = spread.least + np.trace(spread.excess, axis1=1, axis2=2) / 6
+            weight = 1.0 / (within + findings.place_variance * spread.efficiency * sums.alike)
             shown = np.outer(sigmas, sigmas) * (weight @ bends[:, 54:63]).reshape(size, size)
             vector = sigmas * (weight @ bends[:, 63:])
         each = np.tile(np.eye(6), (1, n, 1, 1))
@@ -424,14 +408,10 @@ class SharedModel(LatentPoseModel):
 def pose_priors(state: State) -> gtsam.NonlinearFactorGraph:
     """Priors about the references, and the relative poses that take part."""
     rig, T = state.rig, dict(zip(state.names, state.references, strict=True))
-    rig = rig.model_copy(update={"relative_poses": pairs_that_count(state)})
+    out = {*state.dropped_pairs, *state.contradicting}  # by a move, or by the data
+    pairs = tuple(pair for place, pair in enumerate(rig.relative_poses) if place not in out)
+    rig = rig.model_copy(update={"relative_poses": pairs})
     return objective_graph(rig, {}, T, state.config, terms="full")
-
-
-def pairs_that_count(state: State) -> tuple[RelativePose, ...]:
-    """The relative poses but those that a move has invalidated, or the data contradict."""
-    out = {*state.dropped_pairs, *state.contradicting}
-    return tuple(pair for place, pair in enumerate(state.rig.relative_poses) if place not in out)
 
 
 def contradicting(conflicts: Mapping[int, Conflict]) -> tuple[int, ...]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import pairwise, takewhile
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -136,7 +136,7 @@ class IncrementalCalibrator:
                 frames = frames[len(updates) :]
 
     def update_together(self, frames: Sequence[StreamFrame]) -> list[Update]:
-        """Take in the first of some frames at once: as many as show nothing unusual.
+        """Take in the first of some frames at once: of what is unusual, one alone.
 
         At most up to the end of an epoch. All their updates have the estimate after the last of
         them, which is as of one by one.
@@ -185,22 +185,25 @@ class IncrementalCalibrator:
             if _columns(group[0].table) != _columns(one.table):
                 break
             group.append(one)
-        if not group[1:]:
-            return group
-        alone = [*takewhile(lambda one: not repeated_cameras(state, one.table), group)]
-        return alone or group[:1]
+        if group[1:] and any(repeated_cameras(state, one.table) for one in group):
+            return group[:1]
+        return group
 
     def _take_in(self, state: State, group: Sequence[StreamFrame]) -> tuple[EpochGraph, Taken]:
-        """Absorb the matches that agree, set aside the others, detect events."""
+        """Absorb the matches that agree, set aside the others, detect events.
+
+        Of half the frames, while one of them disagrees or a camera may start.
+        """
         group, table, repeated, blocks = _preprocessed(state, group, self._graph_of(state).rig)
-        gated = _gate(state, blocks)
-        usual = _count_usual(state, group, blocks, gated)
-        if usual < len(group):
-            group = group[: max(usual, 1)]
-            table = table.select(table.frame <= group[-1].frame)
-            blocks = {c: raw.select(raw.frame <= group[-1].frame) for c, raw in blocks.items()}
-            blocks = {camera: raw for camera, raw in blocks.items() if len(raw)}
-            gated = _gate(state, blocks)
+        gated = {
+            camera: Gated.at(state.references[camera], block, state.scales[camera])
+            for camera, block in blocks.items()
+            if state.started[camera]
+        }
+        usual = gated.keys() == blocks.keys()  # no camera may start
+        usual = usual and all(one.agree(state, camera).all() for camera, one in gated.items())
+        if not usual and group[1:]:
+            return self._take_in(state, group[: len(group) // 2])
         begin_frames(state, group)
         graph, events = self._graph_of(state), list[Event]()
         if not usual:
@@ -323,41 +326,10 @@ def _preprocessed(
     for camera, (first, end) in enumerate(pairwise(edges)):
         if end - first >= MIN_MATCHES:
             block = camera_block(cameras[camera], usable.select(rows[first:end]), config)
-            block = block if len(group) == 1 else _with_enough(block)
-            found |= {camera: block} if len(block) else {}
+            enough = block.frame_counts >= MIN_MATCHES
+            if enough.any():
+                found[camera] = block.select(np.repeat(enough, block.frame_counts))
     return group, table, repeated, found
-
-
-def _with_enough(block: CameraBlock) -> CameraBlock:
-    enough = block.frame_counts >= MIN_MATCHES
-    return block if enough.all() else block.select(np.repeat(enough, block.frame_counts))
-
-
-def _gate(state: State, blocks: Mapping[int, CameraBlock]) -> dict[int, Gated]:
-    """The matches of cameras that have started, gated at their estimates."""
-    return {
-        camera: Gated.at(state.references[camera], block, state.scales[camera])
-        for camera, block in blocks.items()
-        if state.started[camera]
-    }
-
-
-def _count_usual(
-    state: State,
-    group: Sequence[StreamFrame],
-    blocks: Mapping[int, CameraBlock],
-    gated: Mapping[int, Gated],
-) -> int:
-    """How many frames come before the first that disagrees, or may start a camera."""
-    first = []
-    for camera, block in blocks.items():
-        numbers = block.frame_numbers
-        if camera in gated:
-            numbers = numbers[~gated[camera].agree(state, camera)]
-        first += numbers[:1].tolist()
-    if not first:
-        return len(group)
-    return sum(one.frame < min(first) for one in group)
 
 
 _FRAMES, _MATCHES = 24, 250  # enough to start a camera, close two epochs and fill a large block

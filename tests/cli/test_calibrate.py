@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -172,17 +171,3 @@ def test_match_writes_a_table(call: Call, tmp_path: Path) -> None:
                       "--frames", "0:3", "--out", tmp_path / "part.csv")  # fmt: skip
     assert code == 0
     assert set(load_correspondences(tmp_path / "part.csv").frame.tolist()) == {0, 1, 2}
-
-
-def test_match_prints_how_many_copies_were_left_out(call: Call, tmp_path: Path) -> None:
-    shutil.copytree(SAMPLE, tmp_path / "data")
-    for path in [*(tmp_path / "data").rglob("000000.*")]:
-        for name in ("000006", "000007"):
-            shutil.copy(path, path.with_stem(name))
-    truth = load_rig(SAMPLE / "reference.yaml")
-    simulate_correspondences(truth, frames=6).save(tmp_path / "table.parquet")
-    code, out, err = call(
-        "match", tmp_path / "data", "--matcher", tmp_path / "table.parquet",
-        "--out", tmp_path / "found.parquet",
-    )  # fmt: skip
-    assert code == 0 and "6 of 8 frames; 2 copies left out" in out + err

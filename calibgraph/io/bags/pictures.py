@@ -93,17 +93,13 @@ def _pixels(message: Any, channels: int, kind: str, where: str) -> NDArray[Any]:
     step = max(message.step, width * item)
     data = np.ascontiguousarray(message.data)
     if not height * width or len(data) < step * (height - 1) + width * item:
-        raise _incomplete(message, where)
+        raise DatasetError(
+            f"{where}: has {len(message.data)} bytes for {message.width}x{message.height} px, "
+            f"encoding {message.encoding!r}; record it again"
+        )
     rows = np.lib.stride_tricks.as_strided(data, (height, width * item), (step, 1), writeable=False)
     pixels = np.ascontiguousarray(rows).view(kind)
     return pixels if channels == 1 else pixels.reshape(height, -1, channels)
-
-
-def _incomplete(message: Any, where: str) -> DatasetError:
-    return DatasetError(
-        f"{where}: has {len(message.data)} bytes for {message.width}x{message.height} px, encoding "
-        f"{message.encoding!r}; record it again"
-    )
 
 
 def _to_8_bits(pixels: NDArray[Any]) -> Image:
