@@ -5,10 +5,10 @@ from threading import Lock
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from calibgraph.arrays import Array, Mask
 from calibgraph.matching.structure.directions import thin
-from calibgraph.matching.structure.nearest_rays import NearestRays
 from calibgraph.matching.structure.windows import Windows, cut_windows
 from calibgraph.memory import mmap_copy, mmap_zeros
 from calibgraph.parallel import KeyedCache
@@ -55,7 +55,8 @@ class WindowTable:
         self._rows = own_pages(kept.astype(np.int32))
         self._centres = own_pages(np.random.default_rng(0).permutation(centres).astype(np.int32))
         self._centre_rows = own_pages(self._rows[self._centres])
-        self._neighbours = NearestRays(rays_m, self._rows, angles[kept], spacing_rad)
+        directions = rays_m[kept] / np.linalg.norm(rays_m[kept], axis=1, keepdims=True)
+        self._tree = cKDTree(directions, balanced_tree=False)
         self._spacing_rad, self._keep_linear = spacing_rad, keep_linear
         self._buffer = _Buffer(len(centres)) if rows is None else None
 
@@ -90,7 +91,7 @@ class WindowTable:
 
     def _cut(self, chosen: Rows) -> tuple[Windows, Mask]:
         windows, reliability = cut_windows(
-            self._cloud, self._centres[chosen], self._neighbours,
+            self._cloud, self._centres[chosen], (self._tree, self._rows),
             spacing_rad=self._spacing_rad, keep_linear=self._keep_linear,
         )  # fmt: skip
         return windows, reliability > MIN_RELIABILITY
@@ -98,7 +99,7 @@ class WindowTable:
     @property
     def nbytes(self) -> int:
         """Size in memory, without the cloud."""
-        kept = self._rows.nbytes + 2 * self._centres.nbytes + self._neighbours.nbytes
+        kept = self._rows.nbytes + 2 * self._centres.nbytes + 2 * int(self._tree.data.nbytes)
         return kept + (self._buffer.nbytes if self._buffer else 0)
 
 

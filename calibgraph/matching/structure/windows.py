@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from calibgraph.arrays import Array, Mask
-from calibgraph.matching.structure.nearest_rays import NearestRays
 from calibgraph.matching.structure.window_kernels import (
     FEATURES,
     describe_windows,
@@ -105,7 +105,7 @@ class Windows:
 def cut_windows(
     cloud: tuple[Array, Array],
     centres: NDArray[np.int32],
-    neighbours: NearestRays,
+    thinned: tuple[cKDTree, NDArray[np.int32]],
     *,
     spacing_rad: float,
     keep_linear: bool,
@@ -115,8 +115,8 @@ def cut_windows(
     Args:
         cloud: (n, 3) rays from the viewpoint to the points, along the axes of the LiDAR frame
             [m]; (n,) their intensity ranks.
-        centres: (w,) of the neighbours' rays, those that are the windows' centres.
-        neighbours: of the thinned rays.
+        centres: (w,) of the thinned rays, those that are the windows' centres.
+        thinned: the directions of (m,) rays, as unit vectors, and their rows of the cloud.
         spacing_rad: of these.
         keep_linear: keep the linear parts of the variation, and describe it.
 
@@ -127,7 +127,11 @@ def cut_windows(
     windows, reliability = Windows.empty(len(centres)), np.zeros(len(centres))
     even = math.sqrt(WINDOW_POINTS / math.pi) * max(spacing_rad, MIN_SPACING_RAD)
     reach = 2 * math.sin(WINDOW_STRETCH * even / 2)  # as a chord
-    windows.members[:], windows.counts[:] = neighbours.of(centres, WINDOW_POINTS, reach)
+    tree, rows = thinned
+    _, nearest = tree.query(tree.data[centres], WINDOW_POINTS, distance_upper_bound=reach)
+    near = nearest < tree.n  # fewer are within reach
+    windows.counts[:] = near.sum(axis=1)
+    windows.members[:] = rows[np.where(near, nearest, centres[:, None])]
     room = make_room(WINDOW_POINTS)
     describe_windows(
         cloud, windows.members, windows.counts, keep_linear, room,
