@@ -36,6 +36,7 @@ from calibgraph.solver.within_place import (
     relative_covariance,
     split_excess,
 )
+from calibgraph.tracking.cause import sure_inflation
 from calibgraph.tracking.eliminate import Eliminated, block_diagonal, eliminate
 from calibgraph.tracking.state import State, rows_of
 from calibgraph.tracking.sums import Numbers, PlaceSums, Sums
@@ -75,7 +76,7 @@ def spread_of(state: State, sums: PlaceSums) -> Spread:
     for camera in map(int, np.flatnonzero(frames)):
         own = scatter[camera]
         if not states_places(state) and state.scatter_of_frames(camera) is not None:
-            own = own * state.inflation(camera)
+            own = own * sure_inflation(state.groups[camera])
         true = hessian[camera] + WEAK
         own = allow_for_few_frames(
             own, true, left[camera], frames=frames[camera], matches=every.matches[camera]
