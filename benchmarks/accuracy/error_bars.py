@@ -4,9 +4,9 @@
     python -m benchmarks.accuracy.error_bars --groups 116:120 --streets 20
 
 A group is a rig with errors of its own, and five streets that it drove through, three frames each:
-one place. Rigs and beams change from group to group; errors of the LiDAR are those of ``simulate
-street --sensor-errors SIZE --vary-layout``, those of the lenses of half the size. Groups 100 to 115
-are to choose by, 116 to 179 are kept out. The second table solves again with the correspondences of
+one place. Rigs and beams change from group to group; errors of the LiDAR are those of
+``tools.scenes.scan_errors``, those of the lenses of half the size. Groups 100 to 115 are to choose
+by, 116 to 179 are kept out. The second table solves again with the correspondences of
 one, two, five, ten and twenty of a group's streets, as far as it has as many, and has the verdicts
 of those tables, without images; the third with those of five, changed: a relative pose is known, a
 camera has no matches or few, frames are repeated.
