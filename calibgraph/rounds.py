@@ -328,7 +328,9 @@ def assign_places(run: MatchingRun) -> MatchingRun:
     found = {name: z for name, z in findings.z_score.items() if name not in findings.missed}
     rig, config = solution.solved_rig, solution.config
     try:
-        table = with_delays(run.correspondences, run.dataset)
+        table = run.correspondences
+        if not config.instant_clouds:
+            table = with_delays(table, run.dataset)
         if findings.place_variance and found:
             camera = max(found, key=lambda name: found[name])
             groups = find_places(run.dataset, rig, camera, seed=config.seed)

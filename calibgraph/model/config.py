@@ -95,6 +95,8 @@ class Config(StrictNumbers):
             ``solve``: ``focal``, ``centre``, ``distortion``; ``lens`` is all three. Also
             ``offset``, how long after its cloud an image is taken, and ``readout`` of a rolling
             shutter; ``clock`` is both.
+        instant_clouds: the points of a cloud count as taken at one instant, although they have
+            times: clouds are corrected for the motion of the vehicle, or it stood.
         seed: of everything random.
         tracking: of the recalibration while driving.
     """
@@ -121,6 +123,7 @@ class Config(StrictNumbers):
     common_cm: Annotated[float, Field(ge=0, le=10_000)] | None = None
     of: Reported = "alignment"
     estimate: Annotated[tuple[LensPart, ...], BeforeValidator(_lens_parts)] = ()
+    instant_clouds: bool = False
     seed: Seed = 0
     tracking: Tracking = Tracking()
 

@@ -35,7 +35,7 @@ _ADVICE = {
     "time_offset_sigma_s), or calibrate them with a target.",
     MOTION: "Correct the clouds for the motion of the vehicle (--motion for bags, --interval-s for "
     "folders), or record while it stands, two frames or more at each stop. If they are corrected "
-    "already, leave the times of points out.",
+    "already, or it stood, state instant_clouds: true in --config.",
     ESTIMATED: "Estimate fewer parts of the lens (--estimate), state how well it is known "
     "(intrinsics_sigma_px, distortion_sigma), or calibrate it with a target.",
 }

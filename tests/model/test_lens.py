@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -11,6 +14,7 @@ import pytest
 
 from calibgraph import (
     Camera,
+    Config,
     Correspondences,
     Dataset,
     Intrinsics,
@@ -22,6 +26,7 @@ from calibgraph import (
     load_correspondences,
     load_dataset,
     load_rig,
+    rounds,
 )
 from calibgraph.errors import CalibrationError, MotionError
 from calibgraph.graph.lens import LensVariable
@@ -264,3 +269,26 @@ def test_a_lens_without_a_word_has_the_priors_of_a_stated_calibration() -> None:
         for each in (camera, stated)
     )
     assert with_sigmas == pytest.approx(without, rel=0.01)  # written to 0.01 px
+
+
+def test_clouds_that_a_config_states_to_be_of_one_instant_are_not_late(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Solved(Exception):
+        """With delays, the run is solved again."""
+
+    def solve(rig: Rig, table: Correspondences, *_: object, **__: object) -> None:
+        raise Solved(table.late_s)
+
+    monkeypatch.setattr(rounds, "solve_joint", solve)
+    data, rig = sweep(tmp_path, STAMPS, {}, **dict.fromkeys(STAMPS, [0.0, 0.1])), rig_of("kitti")
+    for instant in (True, False):
+        solution = SimpleNamespace(
+            solved_rig=rig, rig=rig, config=Config(instant_clouds=instant), terms="full",
+            camera_matches=None,
+        )  # fmt: skip
+        run: Any = SimpleNamespace(
+            correspondences=rows(None), solution=solution, warnings=(), dataset=data, guess=rig
+        )
+        with nullcontext() if instant else pytest.raises(Solved):
+            assert rounds.assign_places(run) is run
