@@ -16,7 +16,7 @@ import os
 import reprlib
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from operator import index
 from pathlib import Path
 from typing import Annotated, Any, BinaryIO, Self
@@ -308,7 +308,7 @@ def _place_of(frame: StreamFrame) -> str:
 
 
 def _with_motion_in_use(rig: Rig, table: Correspondences, before: bool | None) -> Correspondences:
-    """The matches of a frame, with the motion of the LiDAR where a clock uses it.
+    """The matches of a frame, with the motion of the LiDAR if all frames have it.
 
     Args:
         rig: with the clocks of its cameras.
@@ -319,13 +319,11 @@ def _with_motion_in_use(rig: Rig, table: Correspondences, before: bool | None) -
         CorrespondenceError: if it is known of some frames alone.
     """
     known = table.twist_per_s is not None
-    if not any(c.time_offset_s or c.readout_s for c in rig.cameras.values()):
-        return replace(table, twist_per_s=None) if known else table
     if before is not None and before != known:
         found, earlier = ("no ", "one") if not known else ("a ", "none")
         raise CorrespondenceError(
-            f"it has {found}motion of the LiDAR (twist_per_s), earlier frames have {earlier}; the "
-            "rig's time_offset_s and readout_s need it with every frame: give it or leave it out"
+            f"it has {found}motion of the LiDAR (twist_per_s), earlier frames have {earlier}; "
+            "clocks need it with every frame: give it or leave it out"
         )
     if before is None:
         unused_times(rig, is_known=known, how=f"{OF_IMAGES}, {OF_TABLES}")

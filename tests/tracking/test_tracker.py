@@ -22,6 +22,7 @@ from calibgraph import (
     simulate_correspondences,
     solve,
 )
+from calibgraph.simulation.rigs import rig_of
 from calibgraph.tracking import tracker as tracker_module
 from calibgraph.tracking.assessment import json_lines
 from calibgraph.tracking.cause import Steps, find_cause
@@ -72,6 +73,24 @@ def test_a_static_rig_gives_what_a_batch_gives(mixed_rig: Rig) -> None:
         assert last.verdicts[name].status == "PASS"
     assert np.sqrt(np.mean(np.square(apart))) < 0.1
     assert not events_of(updates)
+
+
+def test_where_the_motion_is_known_the_clock_may_err_as_in_a_batch() -> None:
+    """5 ms at 10 m/s are 5 cm ahead, the third axis of a camera that looks there."""
+    rig = with_known_lenses(rig_of("kitti"))
+    still = simulate_correspondences(rig, frames=30, matches=100, errors=ERRORS, seed=1)
+    drives = replace(still, twist_per_s=np.tile([0, 0, 0, 10.0, 0, 0], (len(still), 1)))
+    ahead_cm = []
+    for table in (still, drives):
+        tables = [table.select(table.frame == frame) for frame in range(30)]
+        tracker, updates = tracked(rig, tables)
+        batch, found = solve(rig, table).covariance, updates[-1].covariance
+        ahead_cm.append([100 * np.sqrt(each["image_2"][5, 5]) for each in (found, batch)])
+    (alone, _), (whole, in_batch) = ahead_cm
+    assert whole == pytest.approx(np.hypot(alone, 5.0), rel=0.1)
+    assert whole == pytest.approx(in_batch, rel=0.1)
+    with pytest.raises(CorrespondenceError, match="no motion of the LiDAR .* clocks need it"):
+        tracker.update(replace(still.select(still.frame == 29), frame=np.full(200, 30)))
 
 
 @pytest.mark.parametrize("who", ["left", "right"])
