@@ -95,10 +95,12 @@ def _drawn(case: Key, beams: int, rays: int) -> Record:
 
 
 def _moved(case: Key, beams: int, rays: int) -> Record:
-    """What ``check`` names of a vehicle of which something was moved, or nothing."""
+    """The sensors that ``check`` names, after one has moved or none."""
     rng, after = np.random.default_rng([6, case.seed]), dict(MOUNTS)
     lidar = "front" if case.seed % 2 else "left"
-    step = _step(rng, _TURN * case.kind.endswith("turned"), _SHIFT_M * case.kind.endswith("ifted"))
+    step = _step(
+        rng, _TURN * case.kind.endswith("turned"), _SHIFT_M * case.kind.endswith("shifted")
+    )
     if case.kind.startswith("base"):
         after = {name: T if name == "top" else invert(step) @ T for name, T in MOUNTS.items()}
         lidar = "top"
