@@ -15,8 +15,6 @@ about values that are the same for all checks: one that has seen too little keep
 A kind of check that no case had makes a FAIL by itself from its limit of WARN on.
 """
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from collections.abc import Iterable, Sequence

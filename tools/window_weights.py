@@ -11,8 +11,6 @@ the table shows the summed score at a recording's reference, in standard deviati
 all windows of one weight and with the network's.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """What our method is compared with: the solver that the paper publishes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from itertools import pairwise
 
