@@ -1,7 +1,5 @@
 """README and pages: links, commands, generated parts; their examples, and the tutorial, run."""
 
-from __future__ import annotations
-
 import re
 import shlex
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """The two calls of the library: what is saved, solved again, is what was reported."""
 
-from __future__ import annotations
-
 import pickle
 import shutil
 from collections.abc import Sequence

@@ -1,15 +1,15 @@
 """Real sensor data: the figures that the README gives. Minutes; skipped where the data are not."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import calibgraph
 from calibgraph import Rig
+from calibgraph.model.geometry import transform
 from calibgraph.progress import no_progress
 from calibgraph.rounds import match_in_rounds
 
@@ -83,8 +83,7 @@ def test_a_camera_that_turns_half_a_degree_while_driving_is_found(
     """
     data = calibgraph.load_dataset(sequences(realdata, "05+06+07+08"))
     camera = data.rig.cameras["image_2"]
-    turn = np.eye(4)
-    turn[:3, :3] = cv2.Rodrigues(np.radians([0.0, 0.5, 0.0]))[0]
+    turn = transform(Rotation.from_euler("y", 0.5, degrees=True))
     after = data.rig.moved_to({"image_2": turn @ camera.T_camera_lidar})
     warp = camera.matrix_px @ turn[:3, :3] @ np.linalg.inv(camera.matrix_px)
     (tmp_path / "drive" / "lidar").mkdir(parents=True)

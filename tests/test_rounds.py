@@ -1,7 +1,5 @@
 """Rounds of matching and what follows: held cameras, ties by images, poses elsewhere, clocks."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from unittest.mock import patch
@@ -28,6 +26,7 @@ from calibgraph import (
 )
 from calibgraph.arrays import Array
 from calibgraph.elsewhere import go_on_elsewhere
+from calibgraph.io.dataset import keep_frames
 from calibgraph.matching.run import MatchingRun
 from calibgraph.matching.structure import StructureMatcher
 from calibgraph.model.config import Terms
@@ -48,7 +47,8 @@ from tests.matching.structure.data import with_noise_images
 
 @pytest.fixture(scope="module")
 def data(truth: Rig) -> Dataset:
-    return calibgraph.load_dataset(SAMPLE, truth)
+    """Its features are found once."""
+    return keep_frames(calibgraph.load_dataset(SAMPLE, truth))
 
 
 @pytest.mark.usefixtures("no_image_checks")

@@ -1,14 +1,14 @@
 """The comparison of results, on errors drawn from their covariances."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import calibgraph
 from calibgraph import Calibration, CalibrationError, Check, Verdict
+from calibgraph.model.geometry import transform
 from tests.audit.drifting import draw, template, twist
 
 FINE = {"tolerance_deg": 0.01, "tolerance_cm": 0.5}
@@ -23,9 +23,7 @@ def results(seed: int, count: int = 5, **changed: dict[str, np.ndarray]) -> dict
 
 def lidar_turned(degrees: float) -> Calibration:
     """A result after the LiDAR turned about its upward axis."""
-    angle = np.radians(degrees)
-    T = np.eye(4)
-    T[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    T = transform(Rotation.from_euler("z", degrees, degrees=True))
     of = draw(np.random.default_rng(9))
     return replace(of, rig=of.rig.moved_to({n: old @ T for n, old in of.T_camera_lidar.items()}))
 

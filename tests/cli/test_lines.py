@@ -1,7 +1,5 @@
 """What is wrong in a command line is said in one line, with exit code 2, and nothing is written."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """The ROS 2 node without ROS: messages of rosbags, and a stand-in for rclpy."""
 
-from __future__ import annotations
-
 import logging
 from dataclasses import replace
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Runs of a manifest, on threads and on Dask: what befalls one job is one row."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import signal

@@ -1,7 +1,5 @@
 """Folders of published data sets hold the frames and the rig that they were written from."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -1,7 +1,5 @@
 """The matcher protocol: what a matcher of your own needs, and what it may have."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The server of the page, what outlives it, and what pairs determine."""
 
-from __future__ import annotations
-
 import http.client
 import json
 import signal

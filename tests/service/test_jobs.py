@@ -1,7 +1,5 @@
 """Jobs over HTTP: taken in, run, followed, cancelled; what a result gives."""
 
-from __future__ import annotations
-
 import io
 import zipfile
 from pathlib import Path

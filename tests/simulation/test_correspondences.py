@@ -1,7 +1,5 @@
 """Simulated correspondences: errors as configured; rigs that see all round are calibrated."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

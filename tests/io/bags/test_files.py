@@ -1,7 +1,5 @@
 """Files of bags: whole, damaged, of other recorders, and bombs; every one is read or one line."""
 
-from __future__ import annotations
-
 import builtins
 import bz2
 import sqlite3

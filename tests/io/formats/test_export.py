@@ -1,7 +1,5 @@
 """Every exported file, read by an independent reader; lenses by the formulas of others."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

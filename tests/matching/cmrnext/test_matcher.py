@@ -1,7 +1,5 @@
 """The matcher cmrnext: true flow gives true poses; networks that only repeat something FAIL."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
