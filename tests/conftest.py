@@ -8,7 +8,7 @@ import shutil
 import signal
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from calibgraph import (
     MatcherErrors,
     RelativePose,
     Rig,
+    evaluate,
     load_rig,
     simulate_correspondences,
 )
@@ -110,6 +111,20 @@ def stereo_relative_pose(
     return RelativePose(
         a=a, b=b, T_a_b=T_a_b, rotation_sigma_rad=sigmas[0], translation_sigma_m=sigmas[1]
     )
+
+
+def require_poses(
+    found: Mapping[str, np.ndarray], expected: Mapping[str, np.ndarray], *, atol: float
+) -> None:
+    """Check (4, 4) transforms of all names that are expected."""
+    for name, T in expected.items():
+        np.testing.assert_allclose(found[name], T, rtol=0, atol=atol, err_msg=name)
+
+
+def require_near(found: Rig, truth: Rig, *, deg: float, cm: float) -> None:
+    """Check the error of every camera."""
+    for name, error in evaluate(found, truth).cameras.items():
+        assert error.rotation_error_deg < deg and error.translation_error_cm < cm, name
 
 
 @pytest.fixture

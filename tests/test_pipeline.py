@@ -158,13 +158,6 @@ def test_places_of_the_table_count_in_the_solve(guess: Rig, truth: Rig) -> None:
         assert np.trace(b[:3, :3]) < 0.9 * np.trace(a[:3, :3])
 
 
-def test_the_checks_of_a_solution_are_those_of_its_table(guess: Rig, truth: Rig) -> None:
-    """A solve of a saved table gives its own verdict, to the last check."""
-    first = calibgraph.solve(guess, table_of(truth))
-    again = solve_again(replace(first, rig=first.initial_rig))
-    assert again.verdict == first.verdict
-
-
 def test_the_commands_solve_what_calibrate_saved(
     guess: Rig, truth: Rig, recordings: Sequence[Path], tmp_path: Path, call: Call
 ) -> None:

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import yaml
 
-from calibgraph import evaluate, load_calibration, load_rig, write_rig_template
+from calibgraph import load_calibration, load_rig, write_rig_template
 from tests.cli.conftest import error_line
-from tests.conftest import SAMPLE, Call
+from tests.conftest import SAMPLE, Call, require_near, require_poses
 from tests.io.bags.writing import (
     START_NS,
     Messages,
@@ -89,9 +89,7 @@ def test_a_bag_is_listed_and_its_rig_is_written(call: Call, tmp_path: Path) -> N
     assert code == 0
     assert "/points  sensor_msgs/msg/PointCloud2  6\n" in err
     assert "left looks along LiDAR +y, 14 deg to the right" in err
-    for name, camera in load_rig(SAMPLE).cameras.items():
-        T = load_rig(out).cameras[name].T_camera_lidar
-        np.testing.assert_allclose(T, camera.T_camera_lidar, atol=1e-12)
+    require_poses(load_rig(out).T_camera_lidar, load_rig(SAMPLE).T_camera_lidar, atol=1e-12)
     code, stdout, err = call("rig", bag, "--json")
     assert (code, err) == (0, "")
     found = json.loads(stdout)
@@ -177,18 +175,15 @@ def test_a_bag_without_transforms(call: Call, tmp_path: Path) -> None:
     frames = [node.attrib["args"].split()[-1] for node in nodes]
     assert frames == [f"{name}_optical" for name in MOUNTED]
     truth = load_rig(SAMPLE / "reference.yaml")
-    for error in evaluate(load_calibration(out).rig, truth).cameras.values():
-        assert error.rotation_error_deg < 0.12  # 1 px
-        assert error.translation_error_cm < 3
+    # 1 px
+    require_near(load_calibration(out).rig, truth, deg=0.12, cm=3)
 
 
 def test_a_rig_is_exported_and_the_file_named(call: Call, tmp_path: Path) -> None:
     out = tmp_path / "robot.urdf"
     code, stdout, err = call("export", SAMPLE, "--format", "urdf", "--out", out)
     assert (code, stdout, err) == (0, "", f"{out}: written (urdf)\n")
-    truth = load_rig(SAMPLE).T_camera_lidar
-    for name, T in READERS["urdf"](out).items():
-        np.testing.assert_allclose(T, truth[name], atol=1e-9)
+    require_poses(READERS["urdf"](out), load_rig(SAMPLE).T_camera_lidar, atol=1e-9)
 
 
 def test_options_of_export_reach_the_file(call: Call, tmp_path: Path) -> None:

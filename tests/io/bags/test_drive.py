@@ -17,7 +17,7 @@ from calibgraph import (
 )
 from calibgraph.io.bags.rig import read_bag_rig
 from calibgraph.model.geometry import invert, relative_transform, transform
-from tests.conftest import SAMPLE
+from tests.conftest import SAMPLE, require_poses
 from tests.io.bags.test_moving import messages as messages_of_a_drive
 from tests.io.bags.writing import (
     PERIOD_NS,
@@ -39,9 +39,7 @@ MAKE = Messages("mcap")
 def require_guess(bag: Path | list[Path]) -> tuple[str, ...]:
     """Check that the cameras are where the sample's guess has them; the notes."""
     data = load_dataset(bag)
-    for name, camera in RIG.cameras.items():
-        T = data.rig.cameras[name].T_camera_lidar
-        np.testing.assert_allclose(T, camera.T_camera_lidar, atol=1e-12)
+    require_poses(data.rig.T_camera_lidar, RIG.T_camera_lidar, atol=1e-12)
     return data.notes
 
 
@@ -117,8 +115,7 @@ def test_transforms_of_the_own_bag_count_first(tmp_path: Path) -> None:
     one = write_bag(tmp_path / "one", "mcap", sample_messages(MAKE))
     two = write_bag(tmp_path / "two", "mcap", other)
     options = BagOptions(beside=(two,))
-    for name, T in load_rig(one, options).T_camera_lidar.items():
-        np.testing.assert_allclose(T, RIG.T_camera_lidar[name], atol=1e-12)
+    require_poses(load_rig(one, options).T_camera_lidar, RIG.T_camera_lidar, atol=1e-12)
     assert read_bag_rig(one, options).notes == ()
 
 

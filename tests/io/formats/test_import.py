@@ -23,7 +23,7 @@ from calibgraph import (
 from calibgraph.io.formats.rig_import import read_rig_parts
 from calibgraph.model.geometry import transform
 from calibgraph.model.rig import KNOWLEDGE, IntrinsicsSigma
-from tests.conftest import RADTAN5, make_camera, stereo_relative_pose
+from tests.conftest import RADTAN5, make_camera, require_poses, stereo_relative_pose
 from tests.io.formats.calibration_files import FRONT
 from tests.io.formats.conftest import varied_rig
 from tests.io.written import written_kitti
@@ -170,8 +170,7 @@ def test_one_frame_serves_all_cameras_of_a_chain(tmp_path: Path) -> None:
     files = saved({"chain.yaml": chain, "car.urdf": TEXTS["urdf"]}, tmp_path)
     rig = import_rig(files, camera_frames={"cam0": "front_link"})
     expected = import_rig(saved({"whole.yaml": TEXTS["camchain"]}, tmp_path))
-    for name, T in expected.T_camera_lidar.items():
-        np.testing.assert_allclose(rig.T_camera_lidar[name], T, atol=1e-12)
+    require_poses(rig.T_camera_lidar, expected.T_camera_lidar, atol=1e-12)
 
 
 def test_a_kitti_sequence_is_imported(tmp_path: Path) -> None:
@@ -180,8 +179,7 @@ def test_a_kitti_sequence_is_imported(tmp_path: Path) -> None:
         rig = import_rig([path])
         expected = load_rig(folder)
         assert list(rig.cameras) == ["image_2", "image_3"]
-        for name, T in expected.T_camera_lidar.items():
-            np.testing.assert_allclose(rig.T_camera_lidar[name], T, atol=1e-15)
+        require_poses(rig.T_camera_lidar, expected.T_camera_lidar, atol=1e-15)
 
 
 def test_results_and_rig_files_are_imported_with_their_relative_poses(
