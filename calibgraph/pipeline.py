@@ -33,7 +33,7 @@ from calibgraph.progress import Progress, Stopwatch, no_progress
 from calibgraph.rounds import AnyMatcher, Datasets, match_in_rounds, refine_with_camera_pairs
 from calibgraph.solver.joint import solve_joint
 from calibgraph.trust.assess import assess, assess_run, in_order
-from calibgraph.trust.evidence import Evidence, gather
+from calibgraph.trust.evidence import Evidence
 from calibgraph.trust.image_record import ImageRecord, RunChecks, to_metadata
 from calibgraph.trust.inputs import registered_twists
 from calibgraph.trust.lens_checks import asks_offset
@@ -184,12 +184,8 @@ def solve(
     record = ImageRecord.from_metadata(solution.correspondences.metadata)
     watch = Stopwatch()
     with watch("checks"):
-        evidence = gather(
-            solution,
-            rig,
-            lambda _, groups: record.posteriors_of(solution.solved_rig.cameras, groups),
-            excluded=solution.config.excluded_cameras,
-        )
+        excluded, posteriors = solution.config.excluded_cameras, record.posteriors_of(solution)
+        evidence = Evidence(solution, rig, posteriors, excluded)
         checks = record.checks(evidence, assess(evidence))
     result = to_calibration(evidence, checks)
     motion = solution.correspondences

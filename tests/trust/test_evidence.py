@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import gtsam
 import numpy as np
@@ -27,7 +25,7 @@ from calibgraph.solver.joint import solve_joint
 from calibgraph.solver.pair_refinement import fit_pairs, place_pairs
 from calibgraph.solver.pairs import pair_terms
 from calibgraph.trust.agreement import PairAgreement, check_agreement, pair_agreement
-from calibgraph.trust.evidence import gather
+from calibgraph.trust.evidence import Evidence
 from factors import pose_sigmas
 from tests.conftest import stereo_relative_pose
 from tests.draws.lenses import with_known_lenses
@@ -92,7 +90,7 @@ def test_an_error_shared_by_all_frames_moves_a_camera_without_correspondences_wi
     table = simulated(pair, frames=10).of_camera("left")
     findings = table.metadata | {"systematic_rotation_rad": 0.01, "systematic_translation_m": 0.1}
     table = table.with_metadata(findings)
-    covariance = gather(solve_joint(rig, table), rig).joint_covariance
+    covariance = Evidence(solve_joint(rig, table), rig).joint_covariance
     sigmas = np.sqrt(np.diag(covariance)).reshape(-1, 6)
     assert sigmas[1, :3] == pytest.approx([0.01] * 3, rel=0.05)  # not more: the pair is rigid
     assert sigmas[1, 3:] == pytest.approx([0.1] * 3, rel=0.05)
@@ -106,14 +104,8 @@ def test_a_relative_pose_ties_cameras_unless_matches_contradict_it(
     turn = gtsam.Pose3(gtsam.Rot3.Ry(np.radians(turned_deg)), np.zeros(3)).matrix()
     measured = measured.model_copy(update={"T_a_b": measured.T_a_b @ turn})
     rig = pair.model_copy(update={"relative_poses": (measured,)})
-    seen: list[Sequence[Sequence[str]]] = []
-
-    def measure(covariances: Mapping[str, Array], found: Sequence[Sequence[str]]) -> dict[str, Any]:
-        seen.append(found)
-        return {}
-
-    assert not gather(solve_joint(rig, simulated(rig, frames=10)), rig, measure).posteriors
-    assert seen == [groups or [("left",), ("right",)]]
+    found = Evidence(solve_joint(rig, simulated(rig, frames=10)), rig).tied
+    assert found == (groups or [("left",), ("right",)])
 
 
 SIGMAS = pose_sigmas(rotation_rad=np.radians(0.05), translation_m=0.01)

@@ -19,7 +19,7 @@ from calibgraph.pipeline import to_calibration
 from calibgraph.solver.joint import solve_joint
 from calibgraph.trust import image_evidence
 from calibgraph.trust.assess import assess
-from calibgraph.trust.evidence import gather
+from calibgraph.trust.evidence import Evidence
 from calibgraph.trust.image_evidence import (
     ImageEvidence,
     check_images,
@@ -192,7 +192,7 @@ def left_by_run(pair: Rig) -> Run:
     """The result of a run that saw flat evidence of one camera, and a fault; and its table."""
     solution = solve_joint(pair, simulated(pair, frames=20))
     posterior = PosePosterior(0.1 * FLAT, FLAT, 0.3)
-    evidence = gather(solution, pair, lambda *_: {CAMERA: posterior})
+    evidence = Evidence(solution, pair, {CAMERA: posterior})
     checks = RunChecks(assess(evidence), {CAMERA: [FAILED]}, {CAMERA: [CAUSE]})
     table = solution.correspondences
     seen = table.with_metadata({**table.metadata, **to_metadata(evidence, checks)})
