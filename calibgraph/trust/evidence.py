@@ -10,14 +10,11 @@ import numpy as np
 
 from calibgraph.arrays import Array
 from calibgraph.matching.run import MatchingRun
-from calibgraph.model.config import Terms
 from calibgraph.model.error_sources import ErrorSources
 from calibgraph.model.findings import MatcherFindings, error_components
 from calibgraph.model.geometry import pair_covariances, pose_rows, twist_between
-from calibgraph.model.lens import LensEstimate
 from calibgraph.model.rig import Rig
-from calibgraph.model.verdict import TOLERANCE, Check
-from calibgraph.solver.error_model import Conflict
+from calibgraph.model.verdict import Check
 from calibgraph.solver.matches import CameraBlock
 from calibgraph.solver.solution import Solution
 from calibgraph.trust.pose_posterior import PosePosterior, group_tied, measure_posteriors, widen
@@ -26,39 +23,6 @@ from factors import pose_sigmas
 
 Checks = Mapping[str, Sequence[Check]]
 """Per camera, its checks; a camera without any may be left out."""
-
-
-@dataclass(frozen=True, eq=False)
-class Estimate:
-    """One camera's estimate and the values that its checks need, from a batch or while driving.
-
-    Attributes:
-        has_matches: whether it had correspondences; else it was solved through relative poses.
-        used: correspondences in the final solve.
-        frames: frames that they come from.
-        covariance: (6, 6) of (rotation [rad], translation [m]), or None.
-        is_free: whether its correspondences do not determine it.
-        conflicts: of the relative poses that name this camera.
-        held: whether nothing determines it.
-        excluded: whether the settings exclude its correspondences.
-        scatter_only: whether it is unknown how large the error is that all frames share.
-        tolerance: of the user: rotation [deg] and distance [cm].
-        lens: the parameters of lens and clock that were estimated.
-    """
-
-    has_matches: bool
-    used: int
-    frames: int
-    covariance: Array | None
-    conflicts: tuple[Conflict, ...]
-    converged: bool = True
-    terms: Terms = "full"
-    held: bool = False
-    excluded: bool = False
-    scatter_only: bool = False
-    tolerance: tuple[float, float] = TOLERANCE
-    lens: tuple[LensEstimate, ...] = ()
-    is_free: bool = False
 
 
 @dataclass(frozen=True, eq=False)

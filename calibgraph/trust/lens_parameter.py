@@ -95,16 +95,15 @@ class LensParameter:
     units: Array
 
     @staticmethod
-    def of(name: str, units: Array, freed: Marginal) -> LensParameter:
-        """Of a fit whose last unknowns have these units; others may be free before them."""
+    def of(name: str, units: Array, freed: Marginal, error: float = 0.0) -> LensParameter:
+        """Of a fit whose last unknowns have these units; others may be free before them.
+
+        ``error`` is a further one of each value, in standard deviations of a calibrated lens.
+        """
         count = len(units)
         values, covariance = _beside_others(name, freed, len(freed.values) - count)
-        twist = freed.compensating[:, -count:] @ values
-        return LensParameter(name, values, np.sqrt(np.diag(covariance)), twist, units)
-
-    def with_error(self, sigma: float) -> LensParameter:
-        """With a further error of each value, in standard deviations of a calibrated lens."""
-        return replace(self, sigmas=np.hypot(self.sigmas, sigma))
+        twist, sigmas = freed.compensating[:, -count:] @ values, np.sqrt(np.diag(covariance))
+        return LensParameter(name, values, np.hypot(sigmas, error), twist, units)
 
     @cached_property
     def moved(self) -> tuple[float, float]:
@@ -129,19 +128,15 @@ class LensParameter:
         """Log likelihood ratio of a wrong value against none at all, to compare parameters by."""
         if not math.isfinite(self.sigma):  # not determined
             return 0.0
-        total = math.hypot(self.sigma, limit("lens_wrong"))
-        z_score = min(self.size / self.sigma, _MOST_SIGMAS)
-        return (z_score * limit("lens_wrong") / total) ** 2 / 2 + math.log(self.sigma / total)
+        return self._log_density(limit("lens_wrong")) - self._log_density(0.0)
 
-    def probability(
-        self, tolerance: tuple[float, float] = TOLERANCE, others: Sequence[LensParameter] = ()
-    ) -> float:
+    def probability(self, tolerance: tuple[float, float] = TOLERANCE, blame: float = 1.0) -> float:
         """That the parameter is wrong and displaces the camera beyond a tolerance [deg, cm].
 
         What the estimate adds to it: Bayes' rule, of two kinds of lens parameters, usual ones and
         wrong ones. Their errors are normally distributed with mean zero; wrong ones are rare. What
         usual ones do to the pose is in its error bar. Where one of several was wrong, the others
-        look wrong, too, if each is set free alone; it is the one that explains most.
+        look wrong, too, if each is set free alone: ``blame`` is how likely it is this one.
 
         An aspect ratio that no lens has counts even if the camera moves little when it is set free:
         matches from rounds have followed it. At the default tolerance any size of it counts. At a
@@ -149,10 +144,9 @@ class LensParameter:
         default rotation.
         """
         is_wrong, after, before = self._shares_wrong(tolerance)
-        is_this = softmax([self.evidence, *(other.evidence for other in others)])[0]
-        return max(float(is_wrong * is_this) * after - before, 0.0)
+        return max(is_wrong * blame * after - before, 0.0)
 
-    def probability_with_prior(self, tolerance: tuple[float, float] = TOLERANCE) -> float:
+    def probability_with_prior(self, tolerance: tuple[float, float]) -> float:
         """The same with what was probable before: that these data do not show a wrong lens."""
         is_wrong, after, _ = self._shares_wrong(tolerance)
         return is_wrong * after
@@ -233,16 +227,15 @@ def check_parameter(
     tolerance: tuple[float, float] = TOLERANCE,
     options: str = "",
     *,
-    others: Sequence[LensParameter] = (),
+    blame: float = 1.0,
     unseen: bool = False,
 ) -> Check:
     """Whether a lens parameter is wrong, by RESIDUALS or IMAGES: the value is the probability.
 
-    For a tolerance [deg, cm]; ``options`` are those that its estimate needs, " --interval-s 0.1";
-    ``others`` of its lens have been set free alone, too. ``unseen``: whether what the data do not
-    show counts.
+    For a tolerance [deg, cm]; ``options`` are those that its estimate needs, " --interval-s 0.1".
+    ``unseen``: whether what the data do not show counts.
     """
-    row, probability = threshold("lens"), found.probability(tolerance, others)
+    row, probability = threshold("lens"), found.probability(tolerance, blame)
     if unseen:  # it blames no lens
         probability = max(probability, min(found.probability_with_prior(tolerance), row.warn))
     deg, cm = found.moved
