@@ -330,27 +330,28 @@ class Threshold:
             return grade(not value <= self.warn, not value <= self.fail)
         return grade(not value >= self.warn, not value >= self.fail)
 
-    def check(self, value: float, *, name: str = "", advice: str = "") -> Check:
-        """The check of a value."""
-        status, name, meaning = self.grade(value), name or self.name, advice or self.advice
-        limit = self.fail if status == "FAIL" else self.warn
-        text = f"{name}: {beside(value, limit, self.unit)}"
-        if status != "PASS":
-            side = "above" if self.direction == "at most" else "below"
-            text += f", {side} the limit {in_unit(limit, self.unit)}"
-            text += f": {meaning}" if meaning else ""
-        return self.describe(float(value), status, text, name=name)
+    def check(
+        self,
+        value: float,
+        text: str = "",
+        *,
+        name: str = "",
+        advice: str = "",
+        status: Status | None = None,
+    ) -> Check:
+        """The check of a value; if it is not PASS, the advice follows its sentence.
 
-    def check_in_words(self, value: float, text: str, *, name: str = "") -> Check:
-        """The check of a value with its own sentence; if it is not PASS, the advice follows."""
-        status = self.grade(value)
-        advice = f": {self.advice}" if self.advice and status != "PASS" else ""
-        return self.describe(value, status, text + advice, name=name)
-
-    def describe(self, value: float, status: Status, text: str, *, name: str = "") -> Check:
-        """A check whose sentence, and perhaps status, depend on more than the value."""
-        limits = (self.warn, self.fail, self.unit)
-        return Check(name or self.name, status, text, value, *limits, kind=self.key)
+        ``text`` is its own sentence, in place of one of value and limit.
+        """
+        status, name, advice = status or self.grade(value), name or self.name, advice or self.advice
+        if not text:
+            limit = self.fail if status == "FAIL" else self.warn
+            text = f"{name}: {beside(value, limit, self.unit)}"
+            if status != "PASS":
+                side = "above" if self.direction == "at most" else "below"
+                text += f", {side} the limit {in_unit(limit, self.unit)}"
+        text += f": {advice}" if advice and status != "PASS" else ""
+        return Check(name, status, text, float(value), self.warn, self.fail, self.unit, self.key)
 
 
 def ratio_of(unit: str, tolerance: tuple[float, float]) -> float:

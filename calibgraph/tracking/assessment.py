@@ -11,7 +11,7 @@ import numpy as np
 
 from calibgraph.arrays import Array
 from calibgraph.model.calibration import Calibration
-from calibgraph.model.geometry import invert_each, pair_covariances, pose_rows
+from calibgraph.model.geometry import invert, pair_covariances, pose_rows
 from calibgraph.model.summary import summarize
 from calibgraph.model.verdict import START, Check, Verdict
 from calibgraph.report.as_json import finite
@@ -114,7 +114,7 @@ def _counts(state: State, camera: int) -> dict[str, int]:
 def second_moments(estimate: Estimate) -> Array:
     """(6 n, 6 n) of the mounts about the estimates."""
     mounts, covariance = estimate.window.reported("mount")
-    away = logarithms(estimate.T_camera_lidar @ invert_each(mounts)).ravel()
+    away = logarithms(estimate.T_camera_lidar @ invert(mounts)).ravel()
     return covariance + np.outer(away, away)
 
 

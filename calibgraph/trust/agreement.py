@@ -69,7 +69,7 @@ def pair_agreement_checks(evidence: Evidence) -> dict[str, list[Check]]:
 def check_agreement(found: PairAgreement, camera: str, all_found: Sequence[PairAgreement]) -> Check:
     """The check of one camera of a pair, which other pairs may show to be the other's fault."""
     row, name = threshold("pair_agreement"), f"relative pose of {found.a} and {found.b} by images"
-    status, other = row.grade(found.sigmas), found.b if camera == found.a else found.a
+    other = found.b if camera == found.a else found.a
     text = (
         f"images and correspondences contradict each other on the pose of {found.a} to {found.b} "
         f"by {found.degrees:.2g} deg, {found.centimetres:.2g} cm, {found.sigmas:.3g} sigma"
@@ -78,11 +78,10 @@ def check_agreement(found: PairAgreement, camera: str, all_found: Sequence[PairA
         max((o.sigmas for o in all_found if o is not found and one in (o.a, o.b)), default=0.0)
         for one in (camera, other)
     )
-    if status == "PASS" or not of_other > max(row.warn, own + BLAME_SIGMAS):
-        text += "" if status == "PASS" else f": {row.advice}"
-        return row.describe(found.sigmas, status, text, name=name)
-    text += f": by its other pairs ({of_other:.3g} sigma) it is {other} that is wrong"
-    return row.describe(own, "WARN", text, name=name)
+    if row.grade(found.sigmas) == "PASS" or not of_other > max(row.warn, own + BLAME_SIGMAS):
+        return row.check(found.sigmas, text, name=name)
+    advice = f"by its other pairs ({of_other:.3g} sigma) it is {other} that is wrong"
+    return row.check(own, text, name=name, advice=advice, status="WARN")
 
 
 def pair_agreement(rig: Rig, fit: PairFit, covariance: Array) -> PairAgreement:
@@ -152,7 +151,7 @@ def check_competing_solution(solution: Solution, camera: str) -> Check:
         iterations = _ransac_iterations(row.warn * int(ours.sum()), len(left_out))
         T = frame_pose(seen_by, left_out, solution.config, iterations=iterations)
     if T is None:
-        return row.describe(0.0, "PASS", f"{row.name}: none")
+        return row.check(0.0, f"{row.name}: none")
     theirs = block.within_gate(T, gate_px)
     degrees, centimetres = pose_difference(T, solution.T_camera_lidar[camera])
     apart = zip((degrees, centimetres), tolerance, TOLERANCE, strict=True)
@@ -206,5 +205,5 @@ def place_checks(evidence: Evidence) -> Checks:
             which = f"frame {first}" if first == last else f"frames {first} to {last}"
             number = f"{value:.2g} {row.unit}".rstrip()
             text = f"{row.name}: {number} at place {place + 1} ({which})"
-            checks[name].append(row.check_in_words(value, text))
+            checks[name].append(row.check(value, text))
     return checks

@@ -239,12 +239,12 @@ def check_parameter(
     if unseen:  # it blames no lens
         probability = max(probability, min(found.probability_with_prior(tolerance), row.warn))
     deg, cm = found.moved
-    status, (part, *_) = row.grade(probability), _WORDS[found.name]
     text = f"by the {by}, {found.describe()}; the camera would move by {deg:.2g} deg, {cm:.2g} cm"
-    if status != "PASS":
-        advice = "correct the time stamps" if found.name == TIME else row.advice
-        text += f": {advice}" + (f"; or run with --estimate {part}{options}" if part else "")
-    check = row.describe(probability, status, text, name=f"{found.name} by the {by}: {row.name}")
+    advice = "correct the time stamps" if found.name == TIME else row.advice
+    if part := _WORDS[found.name][0]:
+        advice += f"; or run with --estimate {part}{options}"
+    name = f"{found.name} by the {by}: {row.name}"
+    check = row.check(probability, text, name=name, advice=advice)
     return replace(check, kind=KINDS[by, found.name])
 
 

@@ -144,7 +144,7 @@ def _check_relative_pose(conflict: Conflict) -> Check:
         f"the correspondences contradict the measured {name} by "
         f"{degrees:.2g} deg, {centimetres:.2g} cm, {sigmas:.3g} sigma"
     )
-    return threshold("relative_pose").check_in_words(sigmas, text, name=name)
+    return threshold("relative_pose").check(sigmas, text, name=name)
 
 
 def _check_lens_prior(one: LensEstimate) -> Check:
