@@ -114,14 +114,12 @@ class MatcherFindings:
 
     def to_metadata(self) -> dict[str, Any]:
         """As keys of the metadata; findings without a value have no key."""
-        content: dict[str, Any] = {}
-        for item in fields(self):
-            value = getattr(self, item.name)
-            if item.name in _PER_CAMERA:
-                content |= {item.name: dict(value)} if value else {}
-            elif value is not None and value != item.default:
-                content[item.name] = value
-        return content
+        stated = ((item, getattr(self, item.name)) for item in fields(self))
+        return {
+            item.name: dict(value) if item.name in _PER_CAMERA else value
+            for item, value in stated
+            if value not in (None, {}, item.default)
+        }
 
     @property
     def systematic_sigmas(self) -> tuple[float, float]:
@@ -251,12 +249,10 @@ def error_components() -> ErrorComponents:
     """
     text = (files("calibgraph.model") / "error_components.json").read_text(encoding="utf-8")
     content = json.loads(text)
-    frames = _sizes(content["frames"])
     return ErrorComponents(
         matchers={name: _sizes(one) for name, one in content["matchers"].items()},
-        **{f"pair_{name}": size for name, size in _sizes(content["pairs"]).items()},
-        frame_correlation=frames.pop("correlation"),
-        **frames,
+        **_sizes(content["pairs"]),
+        **_sizes(content["frames"]),
         **_sizes(content["sizes"]),
     )
 
