@@ -29,7 +29,7 @@ from calibgraph.matching.structure.pose_refinement import (
 from calibgraph.model.geometry import T_OPTICAL_LINK, angle_deg, invert, transform
 from calibgraph.model.rig import Rig
 from calibgraph.parallel import core_pool
-from calibgraph.trust.thresholds import limit
+from calibgraph.trust.thresholds import CONVENTION_DEG, CONVENTION_GAIN, CONVENTION_M
 
 _FRAMES = 3  # that a corrected guess is matched in
 _CAMERAS = 3  # of a rig, that they are tried for
@@ -144,7 +144,7 @@ def convention_error_between(
     Of errors that lead about as near, the first of the list, the most common one.
     """
     distances: dict[str, float] = {}
-    most_deg, most_m = limit("convention_rotation"), limit("convention_translation")
+    most_deg, most_m = CONVENTION_DEG, CONVENTION_M
     undone = {name: undo_convention_errors(guesses[name]) for name in results}
     for error in undo_convention_errors(np.eye(4)):
         apart = [_difference(undone[name][error], T) for name, T in results.items()]
@@ -256,7 +256,7 @@ def _sentence(error: str, cameras: Sequence[str]) -> str:
 
 
 def _gains(found: Candidate, given: Candidate) -> bool:
-    return found.z_score >= limit("convention_gain") * given.z_score
+    return found.z_score >= CONVENTION_GAIN * given.z_score
 
 
 def _is_accepted(candidate: Candidate) -> bool:

@@ -18,7 +18,7 @@ from calibgraph.model.geometry import (
 from calibgraph.model.verdict import Check
 from calibgraph.trust.conventions import convention_error_between, in_words
 from calibgraph.trust.evidence import Checks, Evidence
-from calibgraph.trust.thresholds import limit, threshold
+from calibgraph.trust.thresholds import GUESS_TURNED_DEG, SWAP_SLACK, threshold
 
 
 def guess_checks(evidence: Evidence) -> Checks:
@@ -40,7 +40,7 @@ def guess_checks(evidence: Evidence) -> Checks:
         guess = guesses[name]
         degrees = angle_deg(guess[:3, :3] @ result[:3, :3].T)
         metres = float(np.linalg.norm(guess[:3, 3] - result[:3, 3]))
-        is_turned = degrees > max(limit("guess_rotation"), range_deg)
+        is_turned = degrees > max(GUESS_TURNED_DEG, range_deg)
         is_far = is_turned or row.grade(metres) != "PASS"
         error = convention_error_between({"": guess}, {"": result}) if is_far else None
         words = "" if error is None else f"it seems that {in_words(error)}"
@@ -98,7 +98,7 @@ def _squared_distances(guesses: Mapping[str, Array], results: Mapping[str, Array
     angles = np.arctan2(np.linalg.norm(axes, axis=-1), np.trace(R, axis1=-2, axis2=-1) - 1.0)
     centers = [T[..., :3, :3].swapaxes(-1, -2) @ T[..., :3, 3:] for T in (one, two)]
     apart = centers[0] - centers[1]
-    return np.asarray(angles**2 + (apart**2).sum(axis=(-1, -2)) + limit("swap_slack") ** 2)
+    return np.asarray(angles**2 + (apart**2).sum(axis=(-1, -2)) + SWAP_SLACK**2)
 
 
 def point_distance_checks(evidence: Evidence) -> Checks:

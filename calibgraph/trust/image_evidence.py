@@ -43,6 +43,7 @@ from calibgraph.model.verdict import TOLERANCE, Check
 from calibgraph.parallel import Threads, core_pool
 from calibgraph.progress import Progress, no_progress
 from calibgraph.solver.columns import ColumnFit, apply_twist, block_of, fit_columns
+from calibgraph.solver.lens import MATCH_SHARE
 from calibgraph.trust.evidence import Checks, grade_by_images
 from calibgraph.trust.lens_parameter import (
     IMAGES,
@@ -53,7 +54,7 @@ from calibgraph.trust.lens_parameter import (
     lens_variable,
 )
 from calibgraph.trust.pose_posterior import FrameScorer, Images
-from calibgraph.trust.thresholds import limit, threshold
+from calibgraph.trust.thresholds import LENS_FRAMES_BEST, LENS_Z_SCORE, threshold
 from factors import Columns, displace, fields_px
 from factors.columns import DISTORTION
 
@@ -247,7 +248,7 @@ def _fit_at_peaks(
         block,
         camera.T_camera_lidar,
         Columns(camera.lens, names, sigmas),
-        shared_variance=max(of_place, limit("lens_match_share") * len(block)),
+        shared_variance=max(of_place, MATCH_SHARE * len(block)),
         considered=len(DISTORTION),
     )
 
@@ -319,8 +320,8 @@ def evidence_checks(
         return (Check("image evidence", "WARN", text, found.groups),)
     displaced = threshold("displaced_z_score").check(found.displaced_z_score)
     of_pose = displaced, frames_check(found, names)
-    mispaired = found.frames_best <= limit("lens_frames_best")
-    if found.displaced_z_score < limit("lens_z_score") or mispaired:
+    mispaired = found.frames_best <= LENS_FRAMES_BEST
+    if found.displaced_z_score < LENS_Z_SCORE or mispaired:
         return of_pose  # at a wrong extrinsic the lens cannot be measured
     return *of_pose, *(check_parameter(each, IMAGES, tolerance) for each in found.lens)
 

@@ -29,6 +29,7 @@ from calibgraph.model.rig import Camera, Rig
 from calibgraph.model.verdict import TOLERANCE, Check
 from calibgraph.parallel import map_on_cores
 from calibgraph.solver.columns import block_of, fit_columns
+from calibgraph.solver.lens import MATCH_SHARE
 from calibgraph.trust.evidence import Checks, Evidence, grade_by_images
 from calibgraph.trust.inputs import INTERVAL_S, MAX_FRAMES, registered_twists
 from calibgraph.trust.lens_parameter import (
@@ -40,7 +41,7 @@ from calibgraph.trust.lens_parameter import (
     check_parameter,
     lens_variable,
 )
-from calibgraph.trust.thresholds import limit
+from calibgraph.trust.thresholds import LENS_WRONG
 from factors import Columns
 from factors.columns import CLOCK, OFFSET
 
@@ -119,7 +120,7 @@ def check_offset(
 ) -> Check:
     """The check of an offset; of one that is not determined, it tells how much depends on it."""
     check, size = check_parameter(found, by, tolerance, options), float(found.units[0] * found.size)
-    if found.sigmas[0] < limit("lens_wrong"):
+    if found.sigmas[0] < LENS_WRONG:
         return check
     text = "the time of the images is not determined by these data, and taken for right"
     if size and (moved_cm := _TOLD_S * found.moved[1] / size) > _TOLD_CM:
@@ -141,7 +142,7 @@ def fit_offset(
     places = table.places
     block = block_of(camera, replace(table, frame=places.merge_stationary(table.frame)))
     of_place = place_variance * places.frames_per_place(block.frame_numbers)
-    shared = max(of_place, limit("lens_match_share") * len(block))
+    shared = max(of_place, MATCH_SHARE * len(block))
     fit = fit_columns(block, camera.T_camera_lidar, free, shared_variance=shared)
     return None if fit is None else LensParameter.of(TIME, np.array([sigma_s]), fit.free(0))
 
@@ -192,7 +193,7 @@ def _check_camera(evidence: Evidence, name: str) -> list[Check]:
         camera.T_camera_lidar,
         lens,
         loss_scale=solution.scales[name].loss_scale,
-        shared_variance=max(of_place, limit("lens_match_share") * len(some)),
+        shared_variance=max(of_place, MATCH_SHARE * len(some)),
     )
     if fit is None:
         return []

@@ -25,7 +25,7 @@ from calibgraph.model.lens import LensSigmas
 from calibgraph.model.rig import Camera
 from calibgraph.model.verdict import FAIL_ABOVE, PASS_BELOW, TOLERANCE, Check, Status
 from calibgraph.solver.columns import Marginal
-from calibgraph.trust.thresholds import limit, threshold
+from calibgraph.trust.thresholds import LENS_WRONG, LENS_WRONG_SHARE, threshold
 from factors import Columns
 from factors.columns import ASPECT, CENTRE_X, CENTRE_Y, FOCAL
 
@@ -128,7 +128,7 @@ class LensParameter:
         """Log likelihood ratio of a wrong value against none at all, to compare parameters by."""
         if not math.isfinite(self.sigma):  # not determined
             return 0.0
-        return self._log_density(limit("lens_wrong")) - self._log_density(0.0)
+        return self._log_density(LENS_WRONG) - self._log_density(0.0)
 
     def probability(self, tolerance: tuple[float, float] = TOLERANCE, blame: float = 1.0) -> float:
         """That the parameter is wrong and displaces the camera beyond a tolerance [deg, cm].
@@ -160,7 +160,7 @@ class LensParameter:
         if self.name == ASPECT_RATIO:
             wider = min(one / usual for one, usual in zip(tolerance, TOLERANCE, strict=True)) - 1
             counted = math.radians(TOLERANCE[0]) * max(wider, 0.0) / (self.units[0] / 2)
-        wrong, share = limit("lens_wrong"), limit("lens_wrong_share")
+        wrong, share = LENS_WRONG, LENS_WRONG_SHARE
         odds = logit(share) + self._log_density(wrong) - self._log_density(1.0)
         gain = wrong / math.hypot(self.sigma, wrong)
         after = _share_beyond(counted, gain**2 * self.size, gain * self.sigma)
@@ -193,12 +193,12 @@ def _beside_others(name: str, freed: Marginal, others: int) -> tuple[Array, Arra
     if not others or name == ASPECT_RATIO or not np.isfinite(covariance).all():
         return values[last], covariance[last, last]
     wrong = np.array([*product((False, True), repeat=others)])
-    spreads = np.where(wrong, limit("lens_wrong"), 1.0)
+    spreads = np.where(wrong, LENS_WRONG, 1.0)
     total = covariance[first, first] + spreads[:, :, None] ** 2 * np.eye(others)
     gain, misfit = (
         np.linalg.solve(total, each) for each in (covariance[first, last], values[first, None])
     )
-    odds = logit(limit("lens_wrong_share")) * wrong.sum(axis=1)
+    odds = logit(LENS_WRONG_SHARE) * wrong.sum(axis=1)
     fits = values[first] @ misfit[..., 0].T + np.linalg.slogdet(total).logabsdet
     weights = softmax(odds - fits / 2)
     means = values[last] - values[first] @ gain

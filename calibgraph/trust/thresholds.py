@@ -8,17 +8,18 @@ check: a row here, a function that looks the row up by its key, and that functio
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from functools import lru_cache
 from statistics import NormalDist
 
 from calibgraph.matching.structure.acceptance import FALSE_ACCEPTANCE
 from calibgraph.model.verdict import FAIL_ABOVE, PASS_BELOW, TOLERANCE, Threshold
 from calibgraph.solver.covariance import ENOUGH_FRAMES
-from calibgraph.solver.lens import MATCH_SHARE
 
-_WRONG_SIGMAS, _WRONG_SHARE = 20.0, 0.01
-_BEYOND = [NormalDist().inv_cdf(1 - PASS_BELOW / share / 2) for share in (_WRONG_SHARE, 1)]
+LENS_WRONG, LENS_WRONG_SHARE = 20.0, 0.01
+"""The error of a wrong lens parameter, in standard deviations of a calibrated one: 0.2 % of the
+focal length and of fx / fy, 0.002 focal lengths of the principal point, 0.002 of k1, 5 ms of the
+time of an image, or as the rig states; and the share of those that are wrong."""
+_BEYOND = [NormalDist().inv_cdf(1 - PASS_BELOW / share / 2) for share in (LENS_WRONG_SHARE, 1)]
 
 # Limits without a comment are those of a row above, or were chosen on the set tune of
 # benchmarks/accuracy/verdicts.py and counted on its set count.
@@ -127,15 +128,15 @@ THRESHOLDS: tuple[Threshold, ...] = (
               "count as one frame each; take frames while it drives"),
     # the lens, from the residuals and the images
     # By the posterior of a free lens or clock, once from the residuals and once from the images,
-    # and by `lens_wrong` etc. What is under the first limit is no reason: right lenses reach it.
+    # and by ``LENS_WRONG``. What is under the first limit is no reason: right lenses reach it.
     Threshold("lens", "probability of a wrong one", "at most", FAIL_ABOVE, 0.8, "share",
               "Is focal length, principal point, distortion, fx / fy or time of the images wrong, "
               "so that the camera is off by more than the tolerance?", "check the intrinsics, the "
               "image size, and that images are not undistorted twice, cropped or scaled"),
-    # By `lens_wrong` and `lens_wrong_share`, 0.5 % of all parameters err by more than the first,
+    # By ``LENS_WRONG`` and its share, 0.5 % of all parameters err by more than the first limit,
     # and 0.5 % of the wrong ones by more than the second.
-    Threshold("lens_prior", "distance from the rig", "at most", _WRONG_SIGMAS * _BEYOND[0],
-              _WRONG_SIGMAS * _BEYOND[1], "prior sigmas",
+    Threshold("lens_prior", "distance from the rig", "at most", LENS_WRONG * _BEYOND[0],
+              LENS_WRONG * _BEYOND[1], "prior sigmas",
               "How far did an estimated parameter of lens or clock move from what the rig states?",
               "correct the rig, or state how well it is known"),
     # the rounds of matching
@@ -174,33 +175,23 @@ THRESHOLDS: tuple[Threshold, ...] = (
 # fmt: on
 
 
-LIMITS: Mapping[str, float] = {
-    # The error of a wrong lens parameter, in standard deviations of a calibrated one: 0.2 % of the
-    # focal length and of fx / fy, 0.002 focal lengths of the principal point, 0.002 of k1, 5 ms of
-    # the time of an image, or as the rig states; and the share of those that are wrong.
-    "lens_wrong": _WRONG_SIGMAS,
-    "lens_wrong_share": _WRONG_SHARE,
-    # Share of a match's variance that all share: less cannot be told from a wrong lens.
-    "lens_match_share": MATCH_SHARE,
-    # Above this z-score against displaced extrinsics alone the lens is checked by the images: at a
-    # wrong extrinsic it cannot be measured. KITTI 00, the sample: wrong lenses left 3.2 and more.
-    "lens_z_score": 3.0,
-    # Share of the frames whose score is highest at the result: at this and less the lens is not
-    # checked, since images and clouds are mispaired.
-    "lens_frames_best": 0.5,
-    # A result that is turned farther [deg] from its guess, and beyond sqrt(3) times the matcher's
-    # range, is compared with its convention errors.
-    "guess_rotation": 30.0,
-    # Added [m, rad] in quadrature to the distances of swapped cameras: the usual error of a result
-    # is no evidence of a swap.
-    "swap_slack": 0.05,
-    # A convention error explains a guess if, undone, it is nearer to the result than both.
-    "convention_rotation": 30.0,  # deg
-    "convention_translation": 2.5,  # m
-    # It explains a failed guess if the z-score exceeds the guess's by this factor, and chance.
-    "convention_gain": 1.3,
-}
-"""Numbers that decide whether a check counts, or that something is compared with."""
+# Numbers that decide whether a check counts, or that something is compared with.
+
+LENS_Z_SCORE, LENS_FRAMES_BEST = 3.0, 0.5
+"""Above this z-score against displaced extrinsics alone the lens is checked by the images: at a
+wrong extrinsic it cannot be measured. KITTI 00, the sample: wrong lenses left 3.2 and more. And the
+share of the frames whose score is highest at the result: at this and less the lens is not checked,
+since images and clouds are mispaired."""
+GUESS_TURNED_DEG = 30.0
+"""A result that is turned farther from its guess, and beyond sqrt(3) times the matcher's range, is
+compared with its convention errors."""
+SWAP_SLACK = 0.05
+"""Added [m, rad] in quadrature to the distances of swapped cameras: the usual error of a result is
+no evidence of a swap."""
+CONVENTION_DEG, CONVENTION_M = 30.0, 2.5
+"""A convention error explains a guess if, undone, it is nearer to the result than both."""
+CONVENTION_GAIN = 1.3
+"""It explains a failed guess if the z-score exceeds the guess's by this factor, and chance."""
 
 _ROWS = {row.key: row for row in THRESHOLDS}
 
@@ -209,8 +200,3 @@ _ROWS = {row.key: row for row in THRESHOLDS}
 def threshold(key: str, tolerance: tuple[float, float] = TOLERANCE) -> Threshold:
     """The row of a key, with the limits for a tolerance [deg, cm]."""
     return _ROWS[key].at(tolerance)
-
-
-def limit(key: str) -> float:
-    """One of ``LIMITS``."""
-    return LIMITS[key]
