@@ -147,7 +147,7 @@ def convention_error_between(
     most_deg, most_m = CONVENTION_DEG, CONVENTION_M
     undone = {name: undo_convention_errors(guesses[name]) for name in results}
     for error in undo_convention_errors(np.eye(4)):
-        apart = [_difference(undone[name][error], T) for name, T in results.items()]
+        apart = [difference(undone[name][error], T) for name, T in results.items()]
         if all(degrees < most_deg and metres < most_m for degrees, metres in apart):
             shares = (degrees / most_deg + metres / most_m for degrees, metres in apart)
             distances[error] = sum(shares) / len(apart)
@@ -223,7 +223,7 @@ class _Trial:
     def _is_better(self, name: str, found: Candidate, given: Candidate) -> bool:
         """Whether a pose agrees better than the guess, which no search from there would reach."""
         guess, T = self.guess.T_camera_lidar[name], found.body[name].T_camera_lidar
-        degrees, metres = _difference(guess, T)
+        degrees, metres = difference(guess, T)
         in_reach = degrees < math.sqrt(3) * SEARCH_DEG and metres < math.sqrt(3) * SEARCH_M
         return _gains(found, given) and not in_reach
 
@@ -271,7 +271,7 @@ def _corrected(guess: Mapping[str, Array]) -> list[dict[str, Array]]:
     for error in next(iter(by_camera.values()), ()):
         corrected = {name: each[error] for name, each in by_camera.items()}
         apart = (
-            [_difference(T, other[name]) for name, T in corrected.items()]
+            [difference(T, other[name]) for name, T in corrected.items()]
             for other in (guess, *kept)
         )
         if not any(all(deg < _NEAR_DEG and m < _NEAR_M for deg, m in each) for each in apart):
@@ -279,6 +279,6 @@ def _corrected(guess: Mapping[str, Array]) -> list[dict[str, Array]]:
     return kept
 
 
-def _difference(one: Array, two: Array) -> tuple[float, float]:
+def difference(one: Array, two: Array) -> tuple[float, float]:
     """Between two T_camera_lidar: angle [deg], difference of the translations [m]."""
     return angle_deg(one[:3, :3] @ two[:3, :3].T), float(np.linalg.norm(one[:3, 3] - two[:3, 3]))

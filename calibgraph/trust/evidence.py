@@ -47,6 +47,12 @@ class Evidence:
         return tuple(self.solution.T_camera_lidar)
 
     @property
+    def found(self) -> dict[str, Array]:
+        """Per camera that no search has missed, the (4, 4) T_camera_lidar."""
+        T, missed = self.solution.T_camera_lidar, self.findings.missed
+        return {name: T[name] for name in T if name not in missed}
+
+    @property
     def findings(self) -> MatcherFindings:
         """The findings of the matcher."""
         return self.solution.correspondences.findings

@@ -9,14 +9,9 @@ from dataclasses import replace
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.model.geometry import (
-    angle_deg,
-    invert,
-    pose_difference,
-    transform,
-)
+from calibgraph.model.geometry import invert, pose_difference, transform
 from calibgraph.model.verdict import Check
-from calibgraph.trust.conventions import convention_error_between, in_words
+from calibgraph.trust.conventions import convention_error_between, difference, in_words
 from calibgraph.trust.evidence import Checks, Evidence
 from calibgraph.trust.thresholds import GUESS_TURNED_DEG, SWAP_SLACK, threshold
 
@@ -33,20 +28,14 @@ def guess_checks(evidence: Evidence) -> Checks:
         for reach in (findings.range_rotation_deg, findings.range_translation_m)
     )
     row, guesses = replace(row, warn=max(row.warn, range_m)), evidence.guess.T_camera_lidar
-    results = evidence.solution.T_camera_lidar
-    found = {name: T for name, T in results.items() if name not in findings.missed}
-    frame = describe_other_frame(guesses, found)
-    for name, result in results.items():
-        guess = guesses[name]
-        degrees = angle_deg(guess[:3, :3] @ result[:3, :3].T)
-        metres = float(np.linalg.norm(guess[:3, 3] - result[:3, 3]))
-        is_turned = degrees > max(GUESS_TURNED_DEG, range_deg)
-        is_far = is_turned or row.grade(metres) != "PASS"
-        error = convention_error_between({"": guess}, {"": result}) if is_far else None
+    frame = describe_other_frame(guesses, evidence.found)
+    for name, result in evidence.solution.T_camera_lidar.items():
+        degrees, metres = difference(guesses[name], result)
+        is_far = degrees > max(GUESS_TURNED_DEG, range_deg) or row.grade(metres) != "PASS"
+        error = convention_error_between({"": guesses[name]}, {"": result}) if is_far else None
         words = "" if error is None else f"it seems that {in_words(error)}"
-        advice = "; or ".join(filter(None, (words, frame)))
-        check = row.check(metres, advice=advice)
-        if error is not None and check.status == "PASS":
+        check = row.check(metres, advice="; or ".join(filter(None, (words, frame))))
+        if words and check.status == "PASS":
             text = f"{check.text} and {degrees:.3g} deg: {words}"
             check = replace(check, status="WARN", text=text)
         checks[name] = [check]
@@ -55,9 +44,7 @@ def guess_checks(evidence: Evidence) -> Checks:
 
 def swap_checks(evidence: Evidence) -> Checks:
     """Whether a camera ended where another one's guess is; of those that have been found."""
-    missed, T = evidence.findings.missed, evidence.solution.T_camera_lidar
-    found = {name: result for name, result in T.items() if name not in missed}
-    return compare_with_other_guesses(evidence.guess.T_camera_lidar, found)
+    return compare_with_other_guesses(evidence.guess.T_camera_lidar, evidence.found)
 
 
 def compare_with_other_guesses(
