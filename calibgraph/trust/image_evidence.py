@@ -35,7 +35,6 @@ from calibgraph.matching.structure.shift_scores import (
     crop_grids,
 )
 from calibgraph.model.clock import clock_of
-from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.places import NOWHERE, Places
 from calibgraph.model.rig import Camera, Rig
@@ -259,53 +258,29 @@ def image_checks(run: MatchingRun) -> Checks:
     They are scored as by the matcher ``structure``, which does not use all that other matchers use:
     the result of a matcher that does not fail on images gets warnings only. Of a solution with
     camera pairs, the one without them is checked: next to a camera with a wrong lens, a right one
-    is moved, and at the wrong one's place the lens cannot be measured.
+    is moved, and at the wrong one's place the lens cannot be measured. Cameras that a search did
+    not find have no pose to check. Not observable: a principal point wrong along the shorter side
+    of the image (it is equivalent to a rotation).
     """
-    if run.out_of_time:
+    table, config = run.correspondences, run.solution.config
+    solved = run.solution.without_pairs().solved_rig.cameras
+    cameras = {name: of for name, of in solved.items() if name not in table.findings.missed}
+    if run.out_of_time or not cameras:
         return {}
-    rig, config = run.solution.without_pairs().solved_rig, run.solution.config
     try:
-        checks = check_images(
-            run.dataset, rig, run.correspondences,
-            tolerance=config.tolerance, seed=config.seed, progress=run.progress,
+        evidence = measure_image_evidence(
+            run.dataset, Rig(cameras=cameras), places=table.places, seed=config.seed,
+            progress=run.progress,
         )  # fmt: skip
     except (CalibrationError, OSError) as error:  # files that its matcher did not need
         text = f"the images could not be checked: {error}"
-        return {name: [Check("image evidence", "WARN", text)] for name in rig.cameras}
+        return {name: [Check("image evidence", "WARN", text)] for name in solved}
+    names = {frame.index: frame.name for frame in run.dataset.frames}
+    checks = dict[str, tuple[Check, ...]]()
+    for name, found in evidence.items():
+        seen = replace(found, lens=()) if table.is_swept else found
+        checks[name] = *evidence_checks(seen, names, config.tolerance), *pairing_checks(seen)
     return grade_by_images(run, checks)
-
-
-def check_images(
-    dataset: Dataset,
-    rig: Rig,
-    table: Correspondences,
-    *,
-    tolerance: tuple[float, float] = TOLERANCE,
-    seed: int = 0,
-    progress: Progress | None = None,
-) -> dict[str, tuple[Check, ...]]:
-    """Score images and clouds at the extrinsics of a result, and displaced from them.
-
-    Not observable: a principal point wrong along the shorter side of the image (it is equivalent to
-    a rotation).
-
-    Returns:
-        Checks of every camera but those that a search did not find: theirs is no pose to check.
-    """
-    missed = table.findings.missed
-    cameras = {name: camera for name, camera in rig.cameras.items() if name not in missed}
-    if not cameras:
-        return {}
-    evidence = measure_image_evidence(
-        dataset, Rig(cameras=cameras), places=table.places, seed=seed, progress=progress
-    )
-    if table.is_swept:
-        evidence = {name: replace(found, lens=()) for name, found in evidence.items()}
-    names = {frame.index: frame.name for frame in dataset.frames}
-    return {
-        name: (*evidence_checks(found, names, tolerance), *pairing_checks(found))
-        for name, found in evidence.items()
-    }
 
 
 def evidence_checks(
