@@ -59,8 +59,7 @@ RUN_CHECKS: tuple[Callable[[MatchingRun], Checks], ...] = (
 
 def assess(evidence: Evidence) -> dict[str, list[Check]]:
     """Per camera, the checks of a solution."""
-    checks = concatenate([check(evidence) for check in SOLUTION_CHECKS], evidence.cameras)
-    return {name: advise_together(each) for name, each in checks.items()}
+    return concatenate([check(evidence) for check in SOLUTION_CHECKS], evidence.cameras)
 
 
 def assess_run(run: MatchingRun, evidence: Evidence) -> RunChecks:

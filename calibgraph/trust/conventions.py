@@ -236,9 +236,7 @@ class _Trial:
         """The best pose within some degrees and a metre; z-score 0 if few points are in view."""
         camera = self.guess.cameras[name].moved_to(T_camera_lidar)
         points = self.frames[name].clouds[0].points_lidar_m
-        pixels, valid = camera.lens.project(
-            points @ T_camera_lidar[:3, :3].T + T_camera_lidar[:3, 3]
-        )
+        pixels, valid = camera.lens.project(points, T_camera_lidar)
         if np.sum(valid & camera.in_image(pixels)) < _LEAST_POINTS:
             return Candidate({name: camera}, 0.0)
         return approach(self.frames, {name: camera})
