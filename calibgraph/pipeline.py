@@ -37,7 +37,7 @@ from calibgraph.trust.evidence import Evidence
 from calibgraph.trust.image_record import ImageRecord, RunChecks, to_metadata
 from calibgraph.trust.inputs import registered_twists
 from calibgraph.trust.lens_checks import asks_offset
-from calibgraph.trust.probability import TABLES, judge, model_of
+from calibgraph.trust.probability import STRUCTURE, TABLES, judge
 from calibgraph.trust.solution_checks import residuals_of, weaknesses
 from calibgraph.vehicle.rig import LidarResult, calibrate_rig_lidars
 
@@ -197,7 +197,8 @@ def solve(
 def to_calibration(evidence: Evidence, checks: RunChecks) -> Calibration:
     """A solution with its error bar, and its verdict by all checks."""
     solution, cameras = evidence.solution, evidence.cameras
-    model, tolerance = model_of(solution.correspondences.matcher), solution.config.tolerance
+    tolerance, matcher = solution.config.tolerance, solution.correspondences.matcher
+    model = STRUCTURE if matcher == STRUCTURE else TABLES
     models = dict.fromkeys(cameras, model) | dict.fromkeys(checks.unseen, TABLES)
     verdicts = {
         name: judge(each, evidence.probability_beyond(name), tolerance, models[name])
