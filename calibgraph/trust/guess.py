@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from calibgraph.arrays import Array
 from calibgraph.model.geometry import invert, pose_difference, transform
@@ -62,9 +63,12 @@ def compare_with_other_guesses(
     if len(names) == 1 or not results:
         return checks
     squared = np.full((len(names), len(names)), np.nan)  # from a guess to a result, if there is one
-    squared[:, [name in results for name in names]] = _squared_distances(
-        guesses, {name: results[name] for name in names if name in results}
-    )
+    found = [name in results for name in names]
+    ended = np.array([results[name] for name in names if name in results])
+    away = ended @ invert(np.array([*guesses.values()]))[:, None]
+    shifts, turns = away[..., :3, 3], away[..., :3, :3].reshape(-1, 3, 3)
+    angles = Rotation.from_matrix(turns).magnitude().reshape(away.shape[:2])
+    squared[:, found] = angles**2 + (shifts**2).sum(axis=-1) + SWAP_SLACK**2
     own = np.diag(squared)
     ratios = np.sqrt((squared + squared.T) / (own + own[:, None]))
     ratios = np.where(np.isnan(own)[:, None], (squared / own) ** 0.25, ratios)
@@ -75,17 +79,6 @@ def compare_with_other_guesses(
         what = f"distance of this camera and {other} to each other's guess over that to their own"
         checks[name] = [row.check(float(of.min()), name=what)]
     return checks
-
-
-def _squared_distances(guesses: Mapping[str, Array], results: Mapping[str, Array]) -> Array:
-    """(g, r) between T_camera_lidar: centres [m] and angle [rad], and a result's usual error."""
-    one, two = np.array([*guesses.values()])[:, None], np.array([*results.values()])
-    R = one[..., :3, :3] @ two[:, :3, :3].swapaxes(1, 2)
-    axes = R[..., [2, 0, 1], [1, 2, 0]] - R[..., [1, 2, 0], [2, 0, 1]]
-    angles = np.arctan2(np.linalg.norm(axes, axis=-1), np.trace(R, axis1=-2, axis2=-1) - 1.0)
-    centers = [T[..., :3, :3].swapaxes(-1, -2) @ T[..., :3, 3:] for T in (one, two)]
-    apart = centers[0] - centers[1]
-    return np.asarray(angles**2 + (apart**2).sum(axis=(-1, -2)) + SWAP_SLACK**2)
 
 
 def point_distance_checks(evidence: Evidence) -> Checks:
