@@ -104,8 +104,9 @@ class MatcherFindings:
         for key in values.keys() & {*_PER_CAMERA}:
             of = values[key] or {}
             values[key] = {str(name): of[name] for name in of} if isinstance(of, dict) else of
-        if not _COMMON & values.keys():
-            values = _prior_of(metadata.get("matcher")) | values
+        matcher = metadata.get("matcher")
+        if not _COMMON & values.keys() and isinstance(matcher, str) and matcher != UNKNOWN:
+            values = error_components().matchers.get(matcher, {}) | values
         try:
             return _READER.validate_python(values) if values else MatcherFindings()
         except ValidationError as error:
@@ -193,13 +194,6 @@ def _size(value: Any) -> float:
         return float(value) if isinstance(value, (int, float)) else math.inf
     except OverflowError:
         return math.inf
-
-
-def _prior_of(matcher: object) -> dict[str, float]:
-    """The error sizes of a known matcher; empty for others, whose tables have to state them."""
-    known = error_components().matchers
-    named = isinstance(matcher, str) and matcher in known and matcher != UNKNOWN
-    return known[str(matcher)] if named else {}
 
 
 UNKNOWN = "unknown"
