@@ -178,10 +178,8 @@ def _same_lens(seen: Camera, camera: Camera) -> bool:
         return True
     if (seen.width_px, seen.height_px) != (camera.width_px, camera.height_px):
         return False
-    columns, rows = (
-        np.linspace(0.0, size - 1.0, _GRID) for size in (seen.width_px, seen.height_px)
-    )
-    pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+    sides = [np.linspace(0.0, size - 1.0, _GRID) for size in (seen.width_px, seen.height_px)]
+    pixels = np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 2)
     apart = np.hypot(*lens_difference(seen, camera, pixels).T)
     known = apart[np.isfinite(apart)]
     return bool(len(known)) and float(known.max()) <= _SAME_PX
