@@ -174,9 +174,7 @@ def place_checks(evidence: Evidence) -> Checks:
     frames = errors.model.frames
     for name in errors.model.blocks:
         kept, given = (
-            np.bincount(
-                place_of(b.frame_numbers, errors.model.frames), b.frame_counts, len(of_place)
-            )
+            np.bincount(place_of(b.frame_numbers, frames), b.frame_counts, len(of_place))
             for b in (evidence.solution.inliers.blocks[name], evidence.fitted_blocks[name])
         )
         seen = np.flatnonzero(given)
