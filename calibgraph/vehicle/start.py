@@ -21,7 +21,7 @@ from calibgraph.errors import CalibrationError
 from calibgraph.matching.cloud_similarity import find_upright
 from calibgraph.model.geometry import angle_deg, invert, move_points
 from calibgraph.vehicle.lidars import count_matched, refine_poses
-from calibgraph.vehicle.planes import Planes, View, Views, join_planes
+from calibgraph.vehicle.planes import Planes, View, Views, moved, thinned
 
 _CELLS, _CELL_M = 192, 0.5  # of an image from above
 _FROM_M, _TO_M = 0.4, 6.0  # over the ground: what is upright
@@ -130,7 +130,7 @@ def _why_lost(found: Mapping[str, _Placement], placed: Sequence[str]) -> str:
 
 def _look(name: str, views: Sequence[View]) -> _Seen:
     points = [view.points_m for view in views]
-    some = [view.planes.thinned(_MOST_PLANES) for view in views]
+    some = [thinned(view.planes, _MOST_PLANES) for view in views]
     return _Seen(points, some, find_upright(name, points))
 
 
@@ -151,7 +151,7 @@ def _placements(own: _Seen, placed: _Placed, T_up_base: Array, near: _Near) -> l
     if guess is not None:
         score[:, away(guess)[1] > _NEAR_M] = -np.inf
     known = [
-        join_planes([of.planes[i].moved(T) for of, T in placed.values()])
+        np.concatenate([moved(of.planes[i], T) for of, T in placed.values()])
         for i in range(len(own.planes))
     ]
     found, similar = list[_Placement](), np.zeros(len(headings))
