@@ -105,10 +105,7 @@ def _twists_by_steps(T_base_lidar: Array) -> Array:
 
 def _cross_matrix(vectors: Array) -> Array:
     """(n, 3, 3) of (n, 3), with matrix @ x = vector cross x."""
-    matrix = np.zeros((len(vectors), 3, 3))
-    for i, j, k, sign in ((0, 1, 2, -1.0), (1, 2, 0, -1.0), (2, 0, 1, -1.0)):
-        matrix[:, i, j], matrix[:, j, i] = sign * vectors[:, k], -sign * vectors[:, k]
-    return matrix
+    return np.cross(np.eye(3), vectors[:, None])
 
 
 def _of_pair(
