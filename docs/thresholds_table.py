@@ -1,7 +1,5 @@
 """The table of thresholds in the documentation."""
 
-from __future__ import annotations
-
 from calibgraph.model.verdict import TOLERANCE, Threshold, in_unit, is_reachable
 from calibgraph.trust.thresholds import THRESHOLDS
 

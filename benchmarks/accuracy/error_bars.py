@@ -14,8 +14,6 @@ Errors of cameras are of their alignment, those of pairs of their mounts.
 NEES is the squared error in the metric of its covariance; its mean over 6 should be 1.
 """
 
-from __future__ import annotations
-
 from argparse import ArgumentParser
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace

@@ -13,8 +13,6 @@ NEES is the squared error in the metric of its covariance; its mean over 6 shoul
 errors, 95 % should lie within the 95 % quantile of chi-squared with 6 degrees of freedom.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 
 import gtsam
