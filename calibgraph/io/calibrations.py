@@ -100,7 +100,7 @@ class _FrameEntry(BaseModel):
     cloud: str
     images: dict[str, str]
     lidars: dict[str, str] | None = None
-    joined: dict[str, Matrix] | None = None
+    joined: dict[str, tuple[tuple[Finite, ...], ...]] | None = None
     motion: _Motion | None = None
     cloud_columns: tuple[str, ...] | None = None
 
