@@ -58,7 +58,8 @@ class LidarPoses:
         base: its name.
         T_base_lidar: per LiDAR, (4, 4): p_base = T_base_lidar * p_lidar.
         joint_covariance: (6 k, 6 k) of all but the base, in their order.
-        matched: per LiDAR, the share of its planes near others' that lie on them (0-1).
+        matched: per LiDAR, the share of its planes near others' that lie on them (0-1); not of one
+            that cameras place.
         places: instants between which the vehicle has moved.
         place_ratios: variance of rotation and translation between places over its prior.
     """
@@ -133,7 +134,11 @@ def join_poses(parts: Sequence[LidarPoses], names: Sequence[str]) -> LidarPoses:
             for name in names
         },
         joint,
-        {name: min(p.matched[name] for p in parts if name in p.matched) for name in names},
+        {
+            name: min(p.matched[name] for p in parts if name in p.matched)
+            for name in names
+            if any(name in p.matched for p in parts)
+        },
         min(part.places for part in parts),
         (max(p.place_ratios[0] for p in parts), max(p.place_ratios[1] for p in parts)),
     )

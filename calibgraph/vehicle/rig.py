@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -73,7 +73,12 @@ class LidarResult:
 
 
 def calibrate_rig_lidars(
-    dataset: Dataset, rig: Rig, config: Config, *, progress: Progress
+    dataset: Dataset,
+    rig: Rig,
+    config: Config,
+    *,
+    place: Callable[[str], LidarPoses] | None = None,
+    progress: Progress,
 ) -> LidarResult:
     """The poses of a rig's LiDARs in its base, from clouds of instants.
 
@@ -84,6 +89,7 @@ def calibrate_rig_lidars(
         dataset: its frames have the clouds of all LiDARs; those that lack one are left out.
         rig: with the guess of each LiDAR, or none.
         config: the tolerance of the verdict.
+        place: finds by cameras a LiDAR that shares too little, and has a guess.
         progress: called with the stage, its steps done, and their number.
 
     Raises:
@@ -115,7 +121,10 @@ def calibrate_rig_lidars(
         except CalibrationError:
             if len(known) < len(far):
                 raise
-            start, line = {**start, **known}, f"{lost}; begun from the guess"
+            parts = [] if place is None else _placed(known, place)
+            line = f"{', '.join(far)} and {rig.lidar} share too little: placed by cameras"
+            if not parts:
+                start, line = {**start, **known}, f"{lost}; begun from the guess"
         warnings.append(line)
     progress("calibrating LiDARs", 0, 1)
     if start:
@@ -138,6 +147,15 @@ def calibrate_rig_lidars(
         },
         tuple(warnings),
     )
+
+
+def _placed(names: Iterable[str], place: Callable[[str], LidarPoses]) -> list[LidarPoses]:
+    """The poses of LiDARs by cameras; none where no camera is calibrated to both."""
+    try:
+        return [place(name) for name in names]
+    except CalibrationError as error:
+        _log.info("%s", error)
+        return []
 
 
 def _look(
@@ -287,9 +305,9 @@ def judge_lidar(
     What counts data is in the error bar, and no sign of an error. The doubt is about the start:
     where another pose fits as well.
     """
-    covariance = poses.covariance[name]
+    covariance, by_planes = poses.covariance[name], name in poses.matched
     checks = [
-        threshold("lidar_matched").check(poses.matched[name]),
+        *([threshold("lidar_matched").check(poses.matched[name])] if by_planes else []),
         threshold("lidar_instants").check(poses.places),
         *(_loose(covariance, poses.base) or _wide(covariance, tolerance)),
     ]
