@@ -135,7 +135,7 @@ def to_calibration(state: State, estimate: Estimate) -> Calibration:
         pair_covariance=pair_covariances(mounts, rig.T_camera_lidar),
         camera_verdicts=dict(Verdicts(state, estimate)),
         residuals={
-            name: own[0].summary(state.references[camera], state.scales[camera])
+            name: own.raw.summary(state.references[camera], state.scales[camera])
             for camera, name in cameras
             if (own := state.matches_of(camera)) is not None
         },

@@ -349,7 +349,7 @@ def _last_points(state: State, camera: int) -> Array | None:
     """(n, 3) of the last frame, absorbed or, before the camera has started, waiting."""
     if waiting := state.waiting[camera]:
         return waiting[-1].of_camera(state.names[camera]).points_lidar_m
-    if not state.blocks[camera]:
+    if not state.matches[camera]:
         return None
-    last = state.blocks[camera][-1]
+    last = state.matches[camera][-1].raw
     return last.block.points_lidar_m[last.frame_edges[-2] :]

@@ -116,11 +116,6 @@ class Sums:
         outer = self.score[..., :, None] * self.score[..., None, :]
         return np.asarray(self.scatter - outer / whole)
 
-    @staticmethod
-    def stack(parts: Sequence[Sums]) -> Sums:
-        """The sums along a new first axis."""
-        return Sums(np.array([part.packed for part in parts]))
-
     def change(self, **values: Array) -> Sums:
         """The sums with other values of some properties."""
         found = Sums(self.packed.copy())
@@ -213,6 +208,11 @@ class PlaceSums:
         return self.rows.frames
 
     @property
+    def visited(self) -> list[int]:
+        """The rows that have frames."""
+        return [*map(int, np.flatnonzero(self.frames.any(axis=1)))]
+
+    @property
     def count(self) -> float:
         """Number of places."""
         older = self.places[0].max() if self.frames[0].any() else 0.0
@@ -296,3 +296,17 @@ class PlaceSums:
         part = own.change(score=np.zeros_like(own.score), reweighted=reweighted)
         none = Sums.zeros(1, len(self.means))
         return self.without(camera).add([name], none.replace_at((0, camera), part))
+
+
+def block_diagonal(blocks: Array) -> Array:
+    """(6 n, 6 n) from (n, 6, 6)."""
+    n = len(blocks)
+    matrix = np.zeros((n, 6, n, 6))
+    matrix[np.arange(n), :, np.arange(n)] = blocks
+    return matrix.reshape(6 * n, 6 * n)
+
+
+def diagonal_blocks(matrix: Array) -> Array:
+    """(n, 6, 6) of (6 n, 6 n)."""
+    n = len(matrix) // 6
+    return matrix.reshape(n, 6, n, 6)[np.arange(n), :, np.arange(n)]
