@@ -98,7 +98,7 @@ def sums_of(state: State, gated: Mapping[int, Gated]) -> Sums:
     if not np.array_equal(poses, to):
         steps = logarithms(poses @ invert_each(to))
         gradient = gradient + (hessian @ steps[..., None])[..., 0]
-    return Sums.of(
+    return Sums.zeros(len(cameras)).change(
         hessian=hessian,
         gradient=gradient,
         reweighted=here.hessian,
@@ -259,13 +259,11 @@ def start_cameras(state: State, table: Correspondences, seen: Collection[int]) -
         state.put(camera, waiting=waiting[-HISTORY:])
         if len(waiting) % every:
             continue
-        refused = _try_to_start(state, camera)
+        state.put(camera, refused=_try_to_start(state, camera))
         if state.started[camera]:
             events.append(Event("started", name, number, number, state.stamp_ns))
         elif len(waiting) >= HISTORY:  # tried with a full window: the older half is dropped
-            state.put(camera, refused=refused, waiting=waiting[-HISTORY:][HISTORY // 2 :])
-        else:
-            state.put(camera, refused=refused)
+            state.put(camera, waiting=waiting[HISTORY // 2 - HISTORY :])
     return events
 
 
@@ -292,7 +290,7 @@ def _start_camera(state: State, camera: int, T_camera_lidar: Array) -> None:
     curvature = gated.curvature(T_camera_lidar, scale)
     state.put(
         camera,
-        started=True, waiting=(), refused=(), references=T_camera_lidar,
+        started=True, waiting=(), references=T_camera_lidar,
         scales=scale, share=gated.usual_share, curvature=curvature,
     )  # fmt: skip
     _consider_lens(state, camera, raw.select(gated.inliers))
@@ -355,8 +353,7 @@ def absorb_again(state: State, camera: int, raw: CameraBlock | None, T_camera_li
         if len(raw):
             absorb(state, {camera: Gated.at(T_camera_lidar, raw, state.scales[camera])})
     own, bends = state.matches_of(camera), state.bends[camera].copy()
-    kept = (
-        None if own is None else own.raw.select(own.inliers)
-    )  # follow the distortion in another way
-    bends[:54] = _bends_of(state, camera, kept)[:54] if kept else 0.0
+    bends[:54] = 0.0  # the matches follow the distortion in another way
+    if own is not None:
+        bends[:54] = _bends_of(state, camera, own.raw.select(own.inliers))[:54]
     state.put(camera, bends=bends)

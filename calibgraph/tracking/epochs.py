@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.model.geometry import invert_each, retract_all, to_T_lidar_camera
-from calibgraph.solver.robust import median_norm, robust_spread, scale_from
+from calibgraph.model.geometry import invert_each, retract_all
+from calibgraph.solver.robust import median_norm
 from calibgraph.solver.within_place import WEAK
 from calibgraph.tracking.absorption import add_to_totals, count_epoch, sums_of
 from calibgraph.tracking.estimate import EpochGraph, locate_places
@@ -14,8 +14,8 @@ from calibgraph.tracking.events import Event
 from calibgraph.tracking.gate import Gated
 from calibgraph.tracking.moves import report_drift, select_walk, shift_between, update_evidence
 from calibgraph.tracking.state import STRENGTHS, State
-from calibgraph.tracking.sums import Numbers, Sums
-from factors import to_runs
+from calibgraph.tracking.sums import Numbers
+from factors import BlockSums, to_runs
 from factors.pose_kernel import logarithms
 
 _GATE_STEPS = 4  # by the Hessian by weights, which descend: each leaves a fifth of the way
@@ -39,8 +39,7 @@ def close_epoch(state: State, graph: EpochGraph) -> list[Event]:
         _summarize_oldest(state)
     _set_references(state, newest)
     first = int(state.numbers[state.closed])
-    row_of = {name: row for row, name in enumerate(state.settled)}
-    places = np.array([row_of.get(name, -1) for name in state.at], dtype=np.int64)
+    places = state.settled_rows(state.at)
     for camera in range(len(state.names)):
         _regate(state, camera, places, is_steady=bool(steady[camera]))
         count_epoch(state, camera, first)
@@ -61,12 +60,10 @@ def _newest(state: State, graph: EpochGraph) -> Array:
     older, start = state.walks[cameras, 0], state.references[cameras]
     at = start
     for _ in range(_GATE_STEPS if cameras else 0):
-        poses = map(to_T_lidar_camera, at)
-        found = [block.sums(T) for block, T in zip(blocks.values(), poses, strict=True)]
-        steps = logarithms(start @ invert_each(at))[..., None]
-        pull = np.array([sums.gradient for sums in found]) + older.gradient
-        pull += (older.hessian @ steps)[..., 0]
-        whole = np.array([sums.hessian for sums in found]) + older.hessian + WEAK
+        pairs = zip(blocks.values(), at, strict=True)
+        found = BlockSums.join([block.summarize(T[None]) for block, T in pairs])
+        moved = older.shift_reference(logarithms(start @ invert_each(at)))
+        pull, whole = found.gradient + moved.gradient, found.hessian + older.hessian + WEAK
         step = np.asarray(-np.linalg.solve(whole, pull[..., None])[..., 0])
         at = retract_all(at, step)
         if (step * pull).sum(axis=1).min() > -_SMALL_STEP:
@@ -79,13 +76,9 @@ def _set_references(state: State, references: Array) -> None:
     """Take all sums about other references."""
     steps = logarithms(state.references @ invert_each(references))
     state.references = references
-    state.sums = state.sums.shift_reference(
-        np.broadcast_to(steps, (len(state.numbers), *steps.shape))
-    )
+    state.sums = state.sums.shift_reference(steps)
     state.places = state.places.shift_reference(steps)
-    state.walks = state.walks.shift_reference(
-        np.broadcast_to(steps[:, None], (*state.walks.frames.shape, 6))
-    )
+    state.walks = state.walks.shift_reference(steps[:, None])
     state.steps, state.shared = state.steps - steps, state.shared - steps
     if state.drift is not None:
         state.drift = state.drift.about(steps)
@@ -112,8 +105,7 @@ def _regate(state: State, camera: int, places: Numbers, *, is_steady: bool) -> N
     poses[newest | is_steady] = reference
     sizes_px, sizes = raw.all_sizes(poses, to_runs(raw.frame_edges))
     if raw.frames >= state.config.tracking.epoch_frames:
-        least = max(robust_spread(sizes), raw.least_spread)
-        scale = scale_from(robust_spread(sizes_px), least, state.config)
+        scale = raw.scale_of(sizes_px, sizes, state.config)
     gated = Gated(raw, sizes_px * median_norm(raw.information) <= scale.gate_px, poses)
     state.put(camera, scales=scale, share=gated.usual_share)
     if (shown := gated.select(newest) if state.walk[camera] else gated).enough.any():
@@ -146,10 +138,8 @@ def _summarize_oldest(state: State) -> None:
         if (own := state.matches_of(camera)) is not None:
             kept = own.raw.frame_numbers > state.numbers[size - 1]
             state.put(camera, matches=(own.select(kept),) if kept.any() else ())
-    walks = state.walks + Sums(np.repeat(epoch.packed[:, None], len(STRENGTHS), axis=1))
-    variance = state.walk_variance(STRENGTHS, size)
-    over = np.repeat(state.overconfidence[:, None], len(STRENGTHS), axis=1)
-    state.walks = walks.after_walk(np.broadcast_to(variance, (*over.shape, 6)), over)
+    variance, walks = state.walk_variance(STRENGTHS, size), state.walks + epoch[:, None]
+    state.walks = walks.after_walk(variance, state.overconfidence[:, None])
     state.places = state.places.add(names, frames).bounded()
     for camera, before in enumerate(drifted):
         if state.walk[camera]:

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
-import gtsam
 import numpy as np
 
 from calibgraph.arrays import Array, Mask
@@ -55,11 +54,13 @@ class Spread(NamedTuple):
         least: (n,) k, variance of matches of what they do not share, over that of independent ones.
         excess: (n, 6, 6) K - k.
         efficiency: (n,) of independent matches: their true variance over that of H, in the mean.
+        cloud: (6, 6) covariance of the cloud at a place, as the matcher states it.
     """
 
     least: Array
     excess: Array
     efficiency: Array
+    cloud: Array
 
 
 def spread_of(state: State, sums: PlaceSums) -> Spread:
@@ -83,7 +84,8 @@ def spread_of(state: State, sums: PlaceSums) -> Spread:
         root = np.linalg.cholesky(reweighted[camera] + WEAK)
         covariance, efficiency[camera] = relative_covariance(own, root, true)
         least[camera], excess[camera] = split_excess(covariance)
-    return Spread(least, excess, efficiency)
+    sizes = state.findings.place_rotation_rad, state.findings.place_translation_m
+    return Spread(least, excess, efficiency, pose_covariance(*np.square(sizes)))
 
 
 def states_places(state: State) -> bool:
@@ -121,15 +123,13 @@ class Terms:
     def of(state: State, sums: PlaceSums, rows: Sequence[int], spread: Spread) -> Terms:
         """Of some rows of the sums over all frames."""
         own, findings, prior = sums.rows[rows], state.findings, error_components()
-        frames, places, settled = own.frames, sums.places[rows], state.settled
+        frames, places = own.frames, sums.places[rows]
         names, weighted = tuple(sums.names[row] for row in rows), own.reweighted + WEAK
-        row_of = dict(zip(settled, range(len(settled)), strict=True))
-        known = np.array([row_of.get(name, -1) for name in names], dtype=np.int64)
+        known = state.settled_rows(names)
         stated = findings.place_variance * spread.efficiency
         excess = spread.excess + (stated * frames / places)[..., None, None] * np.eye(6)
         seen, inverse = frames > 0, np.linalg.inv(np.linalg.cholesky(weighted))
         alike = np.where(seen, places, np.inf).min(axis=1)
-        of_cloud = np.square([findings.place_rotation_rad, findings.place_translation_m])
         return Terms(
             names,
             known,
@@ -137,7 +137,7 @@ class Terms:
             weighted * (seen / spread.least)[..., None, None],
             _minimum(state, own, known, weighted),
             state.ratios.cameras * (inverse.swapaxes(2, 3) @ excess @ inverse),
-            state.ratios.cloud * pose_covariance(*of_cloud) / alike[:, None, None],
+            state.ratios.cloud * spread.cloud / alike[:, None, None],
             prior.robust_sigmas if sums.count >= prior.robust_places else np.inf,
         )
 
@@ -234,9 +234,7 @@ def _minimum(state: State, own: Sums, known: Numbers, weighted: Array) -> Array:
     The gradient is that of the robust cost, by its true Hessian, where matches of the place show
     the cameras at the optimum of the last epoch; of a new place, at its own minimum.
     """
-    if (known < 0).all():
-        return np.asarray(-np.linalg.solve(own.hessian + WEAK, own.gradient[..., None])[..., 0])
-    at = np.where((known >= 0)[:, None, None], state.steps[known], 0.0)
+    at = np.concatenate([state.steps, np.zeros_like(own.gradient[:1])])[known]
     pull = own.gradient + (own.hessian @ at[..., None])[..., 0]
     by = np.where((known >= 0)[:, None, None, None], weighted, own.hessian + WEAK)
     return np.asarray(at - np.linalg.solve(by, pull[..., None])[..., 0])
@@ -279,26 +277,25 @@ class EpochGraph:
         self.settled, self.contradicting = state.settled, state.contradicting
         self.rig = state.rig_at(state.references)
         self.sums = state.sums_before_epochs()[-2]
-        self.places = closed_places(state)
+        self.places = state.places.add(state.at[: state.closed], state.sums[: state.closed])
+        for camera in state.drifting:
+            self.places = self.places.without(camera)
         frames = self.places.frames.sum(axis=0)
         self._is_settled = bool((frames[state.started] >= _SETTLED).all())
         self.spread = spread_of(state, self.places)
-        self.pose_graph = pose_priors(state)
-        T = dict(zip(state.names, state.references, strict=True))
+        out = {*state.dropped_pairs, *state.contradicting}  # by a move, or by the data
+        pairs = tuple(p for place, p in enumerate(state.rig.relative_poses) if place not in out)
+        rig, T = state.rig.model_copy(update={"relative_poses": pairs}), self.rig.T_camera_lidar
+        self.pose_graph = objective_graph(rig, {}, T, state.config, terms="full")
         self.prior = pose_equations(self.pose_graph, state.names, T)
         self.window = self.new_window(state)
         self._held: dict[frozenset[str], tuple[Array, Array]] = {}
 
-    def new_window(self, state: State) -> Window:
-        """What all places share, by the present ratios."""
-        return Window(self.shared_model(state, self.places, self.spread), state.references)
-
     def is_of(self, state: State) -> bool:
         """Whether the state is of the same epoch, with no change but more frames."""
         same = state.references is self.references and state.settled is self.settled
-        return (
-            same and state.findings == self.findings and state.contradicting == self.contradicting
-        )
+        same = same and state.findings is self.findings
+        return same and state.contradicting == self.contradicting
 
     def equation_5(self, sums: Sums) -> Array:
         """(n, 6) from the references to the minimum of Eq. 5 of the paper."""
@@ -315,7 +312,12 @@ class EpochGraph:
         open_sums = state.sums[state.closed :]
         sums = self.sums + open_sums.total()
         every = every_place(state, self.places, sums)
-        own = self.open_places(state, every)
+        names = {*state.at[state.closed :], *state.at[-1:]}
+        if not self._is_settled:  # that of all places changes with each frame
+            self._held.clear()
+            names |= {*every.names}
+        rows = [row for row in every.visited if every.names[row] in names]
+        own = Terms.of(state, every, rows, self.open_spread(state, every))
         touched = frozenset(own.names)
         if touched not in self._held:
             self._held[touched] = self._others(state, touched)
@@ -332,16 +334,6 @@ class EpochGraph:
         few = np.repeat(sums.frames < ENOUGH_FRAMES, 6)
         covariance[few], covariance[:, few] = np.nan, np.nan
         return Estimate(T, covariance, sums, self._conflicts(state, sums), self.window)
-
-    def open_places(self, state: State, every: PlaceSums) -> Terms:
-        """Those of the frames of the open epoch, and the last one; of a drift, all that it has."""
-        names = {*state.at[state.closed :], *state.at[-1:]}
-        if not self._is_settled:  # that of all places changes with each frame
-            self._held.clear()
-            names |= {*every.names}
-        rows = [row for row in every.visited if every.names[row] in names]
-        spread = self.open_spread(state, every)
-        return Terms.of(state, every, rows, spread)
 
     def open_spread(self, state: State, every: PlaceSums) -> Spread:
         """That of all frames; of many, the open epoch hardly changes it."""
@@ -398,9 +390,9 @@ class EpochGraph:
             for place, pair in measured.items()
         }
 
-    def shared_model(self, state: State, sums: PlaceSums, spread: Spread) -> LatentPoseModel:
-        """What all places share."""
-        findings, bends, n = state.findings, state.bends, len(state.names)
+    def new_window(self, state: State) -> Window:
+        """What all places share, by the present ratios."""
+        findings, bends, n, spread = state.findings, state.bends, len(state.names), self.spread
         sigmas, shared = np.asarray(findings.bend_sigmas), state.ratios.shared
         size = len(sigmas)
         jacobian, shown, vector = np.zeros((n, 6, size)), np.zeros((size, size)), np.zeros(size)
@@ -408,7 +400,8 @@ class EpochGraph:
             hessian, pulled = bends[:, :36].reshape(-1, 6, 6), bends[:, 36:54].reshape(-1, 6, size)
             jacobian = np.linalg.solve(hessian + WEAK, pulled) * sigmas
             within = spread.least + np.trace(spread.excess, axis1=1, axis2=2) / 6
-            weight = 1.0 / (within + findings.place_variance * spread.efficiency * sums.alike)
+            alike = findings.place_variance * spread.efficiency * self.places.alike
+            weight = 1.0 / (within + alike)
             shown = np.outer(sigmas, sigmas) * (weight @ bends[:, 54:63]).reshape(size, size)
             vector = sigmas * (weight @ bends[:, 63:])
         each = np.tile(np.eye(6), (1, n, 1, 1))
@@ -426,7 +419,8 @@ class EpochGraph:
             distortion_vector=vector,
             distortion_size=shared,
         )
-        return SharedModel(state.names, {}, (), self.pose_graph, components, state.config.of)
+        model = SharedModel(state.names, {}, (), self.pose_graph, components, state.config.of)
+        return Window(model, state.references)
 
 
 @dataclass(frozen=True, eq=False)
@@ -437,24 +431,6 @@ class SharedModel(LatentPoseModel):
     def matched(self) -> list[int]:
         """All cameras, by number."""
         return [*range(len(self.cameras))]
-
-
-def pose_priors(state: State) -> gtsam.NonlinearFactorGraph:
-    """Priors about the references, and the relative poses that take part."""
-    rig, T = state.rig, dict(zip(state.names, state.references, strict=True))
-    out = {*state.dropped_pairs, *state.contradicting}  # by a move, or by the data
-    pairs = tuple(pair for place, pair in enumerate(rig.relative_poses) if place not in out)
-    rig = rig.model_copy(update={"relative_poses": pairs})
-    return objective_graph(rig, {}, T, state.config, terms="full")
-
-
-def closed_places(state: State) -> PlaceSums:
-    """The sums of closed epochs at all places; of a drifting camera, none."""
-    closed = state.closed
-    places = state.places.add(state.at[:closed], state.sums[:closed])
-    for camera in state.drifting:
-        places = places.without(camera)
-    return places
 
 
 def every_place(state: State, closed: PlaceSums, sums: Sums) -> PlaceSums:

@@ -273,6 +273,11 @@ class State:
             self.put(camera, matches=(Gated.join(self.matches[camera]),))
         return self.matches[camera][0]
 
+    def settled_rows(self, names: Iterable[str]) -> Numbers:
+        """(k,) which of the places with a known optimum they are; -1: of none."""
+        row_of = dict(zip(self.settled, range(len(self.settled)), strict=True))
+        return np.array([row_of.get(name, -1) for name in names], dtype=np.int64)
+
     def first_row(self, number: int) -> int:
         """The first of the frames that is not before a number."""
         return int(np.searchsorted(self.numbers, number))
@@ -331,15 +336,15 @@ class State:
             before: number of a frame from which on none counts.
         """
         sums = self.walks[np.arange(len(self.walk)), self.walk]
-        of_epochs, walks = self.sums_of_epochs(before), self.walk.any()
+        of_epochs = self.sums_of_epochs(before)
+        if not self.walk.any():
+            return Sums(np.concatenate([sums.packed[None], of_epochs.packed]).cumsum(axis=0))
         found = [sums.packed]
-        for epoch, size in enumerate(self.sizes):
-            sums = sums + of_epochs[epoch]
-            if walks and epoch < len(self.sizes) - 1:
-                variance = self.walk_variance(STRENGTHS[self.walk], size)
-                sums = sums.after_walk(variance, self.overconfidence)
+        for epoch, size in zip(of_epochs.packed[:-1], self.sizes[:-1], strict=True):
+            variance = self.walk_variance(STRENGTHS[self.walk], size)
+            sums = Sums(sums.packed + epoch).after_walk(variance, self.overconfidence)
             found.append(sums.packed)
-        return Sums(np.array(found))
+        return Sums(np.array([*found, sums.packed + of_epochs.packed[-1]]))
 
     def all_sums(self, before: int | None = None) -> Sums:
         """(n,) over all frames, or those before a frame's number."""

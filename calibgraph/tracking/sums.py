@@ -35,11 +35,7 @@ Numbers = NDArray[np.int64]
 
 _POSE = 6
 _SQUARE = _POSE * _POSE
-_PARTS = {
-    "hessian": _SQUARE, "reweighted": _SQUARE, "scatter": _SQUARE,
-    "gradient": _POSE, "score": _POSE, "frames": 1, "matches": 1,
-}  # fmt: skip
-_SIZE = sum(_PARTS.values())
+_SIZE = 3 * _SQUARE + 2 * _POSE + 2
 _LEAST_EIGENVALUE = 1e-9  # of the unit-diagonal Hessian: rounding noise is near 1e-15
 
 
@@ -54,13 +50,6 @@ class Sums:
     """
 
     packed: Array
-
-    @staticmethod
-    def of(**values: Array) -> Sums:
-        """Of all the properties."""
-        shape = values["frames"].shape
-        parts = [values[name].reshape(*shape, size) for name, size in _PARTS.items()]
-        return Sums(np.concatenate(parts, axis=-1))
 
     @staticmethod
     def zeros(*shape: int) -> Sums:
@@ -126,10 +115,6 @@ class Sums:
     def __add__(self, other: Sums) -> Sums:
         return Sums(self.packed + other.packed)
 
-    def __mul__(self, weight: Array) -> Sums:
-        """All of them times (...) weights."""
-        return Sums(self.packed * np.asarray(weight)[..., None])
-
     def __getitem__(self, index: Any) -> Sums:
         """A part of the leading axes."""
         return Sums(self.packed[index])
@@ -145,7 +130,7 @@ class Sums:
         return Sums(self.packed.sum(axis=0))
 
     def shift_reference(self, steps: Array) -> Sums:
-        """The sums about references that are moved by (..., 6) tangent steps."""
+        """The sums about references that are moved by (..., 6) tangent steps; axes broadcast."""
         moved = (self.hessian @ steps[..., None])[..., 0]
         return self.change(gradient=self.gradient + moved)
 
@@ -161,7 +146,7 @@ class Sums:
         hessian, back = gain @ hessian, gain.swapaxes(-1, -2)
         hessian = (hessian + hessian.swapaxes(-1, -2)) / 2
         kept = np.asarray(np.trace(gain, axis1=-2, axis2=-1) / _POSE)
-        return (self * kept).change(
+        return Sums(self.packed * kept[..., None]).change(
             hessian=hessian,
             gradient=(gain @ self.gradient[..., None])[..., 0],
             scatter=gain @ self.scatter @ back + hessian * variance[..., None, :] @ hessian,

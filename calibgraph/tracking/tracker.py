@@ -315,9 +315,7 @@ def _preprocessed(
             block = camera_block(cameras[camera], usable.select(rows[first:end]), config)
             enough = block.frame_counts >= MIN_MATCHES
             if enough.any():
-                found[camera] = block
-                if not enough.all():
-                    found[camera] = block.select(np.repeat(enough, block.frame_counts))
+                found[camera] = block.select(np.repeat(enough, block.frame_counts))
     return group, table, repeated, found
 
 

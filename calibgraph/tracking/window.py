@@ -51,6 +51,7 @@ class Window:
         shared.insert(self._start)
         size = _POSE * len(cameras)
         self.chain = np.hstack([-adjoints(references).reshape(-1, _POSE), np.eye(size)])
+        self._rounded = 1.0 + _ROUNDING * np.eye(_POSE + size)
         parameters = gtsam.ISAM2Params()
         parameters.setFactorization("QR")  # Cholesky takes sigmas 4096 times apart for singular
         parameters.setRelinearizeThreshold(_RELINEARIZE)
@@ -68,8 +69,8 @@ class Window:
             hessian: (6 + 6 n, 6 + 6 n).
             gradient: (6 + 6 n,) at the references.
         """
-        hessian = hessian + np.diag(_ROUNDING * np.diag(hessian))
-        graph, whole = gtsam.NonlinearFactorGraph(), self._factor(hessian, -gradient)
+        graph = gtsam.NonlinearFactorGraph()
+        whole = self._factor(hessian * self._rounded, -gradient)
         graph.add(gtsam.LinearContainerFactor(whole, self._start))
         result = self._isam.update(graph, gtsam.Values(), self._slots)
         self._slots = [*result.getNewFactorsIndices()]

@@ -21,7 +21,7 @@ def part(name: str, seed: int, frames: int = 3) -> tuple[str, Sums]:
     rng = np.random.default_rng(seed)
     roots, scores = rng.standard_normal((2, 6, 6)), rng.standard_normal((frames, 2, 6))
     hessian = roots @ roots.swapaxes(1, 2)
-    return name, Sums.of(
+    return name, Sums.zeros(2).change(
         hessian=hessian,
         gradient=rng.standard_normal((2, 6)),
         reweighted=hessian,
