@@ -209,12 +209,12 @@ def count_repeats(state: State, given: Correspondences, again: Collection[int]) 
         given: the correspondences of a frame.
         again: numbers of its cameras that repeat.
     """
-    if not again and not state.counts[:, COUNTS.index("repeated")].any():
+    before = state.counts[:, COUNTS.index("repeated")]
+    if not again and not before.any():
         return
     for number in np.unique(given.camera_index).tolist():
         camera = state.names.index(given.cameras[number])
-        before = state.counted(camera, "repeated")
-        state.count(camera, repeated=1 if number in again else -before)
+        state.count(camera, repeated=1 if number in again else -int(before[camera]))
 
 
 def count_absent(state: State, used: Collection[int], frame: StreamFrame) -> list[Event]:

@@ -108,8 +108,9 @@ def covariance_by_camera(estimate: Estimate, names: tuple[str, ...]) -> dict[str
 
 def _counts(state: State, camera: int) -> dict[str, int]:
     """Correspondences and frames, by what became of them."""
-    counts = {key: state.counted(camera, key) for key in ("given", "used", "left_out", "failed")}
-    used, waiting = state.counted(camera, "absorbed"), len(state.waiting[camera])
+    counts = dict(zip(COUNTS, state.counts[camera].tolist(), strict=True))
+    used, waiting = counts.pop("absorbed"), len(state.waiting[camera])
+    del counts["repeated"]
     frames = used + counts["left_out"] + waiting
     return {**counts, "frames": frames, "frames_used": used, "frames_waiting": waiting}
 

@@ -115,8 +115,11 @@ def unexplained(steps: Steps) -> tuple[float, float]:
     """Squared sigmas that are left by a move of the LiDAR, and by one of the best camera."""
     step, _ = _lidar_step(steps)
     by_lidar = squared_sigmas(steps.step - steps.by_lidar @ step, steps.covariance)
-    places = range(len(steps.cameras))
-    return by_lidar, min(_left_by_camera(steps, place) for place in places)
+    all_rows, by_camera = np.arange(len(steps.step)), []
+    for place in range(len(steps.cameras)):  # the steps of all others: zero if it moved alone
+        rows = np.delete(all_rows, pose_rows(place))
+        by_camera.append(squared_sigmas(steps.step[rows], steps.covariance[np.ix_(rows, rows)]))
+    return by_lidar, min(by_camera)
 
 
 def _lidar_step(steps: Steps) -> tuple[Array, Array]:
@@ -125,13 +128,6 @@ def _lidar_step(steps: Steps) -> tuple[Array, Array]:
     whitened = np.linalg.solve(steps.covariance, design)
     covariance: Array = np.asarray(np.linalg.inv(design.T @ whitened), dtype=np.float64)
     return covariance @ (whitened.T @ steps.step), covariance
-
-
-def _left_by_camera(steps: Steps, place: int) -> float:
-    """Squared sigmas of all other cameras' steps: zero if only this one moved."""
-    rows = np.ones(len(steps.step), dtype=np.bool_)
-    rows[pose_rows(place)] = False
-    return squared_sigmas(steps.step[rows], steps.covariance[np.ix_(rows, rows)])
 
 
 def squared_sigmas(step: Array, covariance: Array) -> float:

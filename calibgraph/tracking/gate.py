@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -104,9 +104,8 @@ def refine(raw: CameraBlock, start: Array, scale: ResidualScale, config: Config)
     T = start
     widening = max(config.pnp_threshold_px / scale.gate_px, 1.0)
     for factor in (widening, 1.0):
-        wide = ResidualScale(
-            scale.sigma, scale.loss_scale * factor, scale.gate_px * factor, scale.sigma_px
-        )
+        gate_px, loss_scale = scale.gate_px * factor, scale.loss_scale * factor
+        wide = replace(scale, gate_px=gate_px, loss_scale=loss_scale)
         inliers = raw.without_outliers(T, wide)
         if len(inliers) < MIN_MATCHES:
             return start

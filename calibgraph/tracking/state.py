@@ -235,10 +235,6 @@ class State:
         for name, number in more.items():
             self.counts[camera, COUNTS.index(name)] += number
 
-    def counted(self, camera: int, name: str) -> int:
-        """A count of a camera."""
-        return int(self.counts[camera, COUNTS.index(name)])
-
     @property
     def names(self) -> tuple[str, ...]:
         """The cameras' names."""
