@@ -124,11 +124,7 @@ def rig(
         print_json(found | written | (guess.to_mapping() if guess else {}))
         return
     lines = [f"{each['topic']}  {each['type']}  {each['messages']}" for each in topics]
-    _print_rig([*lines, *(guess.lines if guess else describe_rig(made)), *notes], out)
-
-
-def _print_rig(lines: list[str], out: Path | None) -> None:
-    for line in lines:
+    for line in [*lines, *(guess.lines if guess else describe_rig(made)), *notes]:
         print_line(line)
     end = f"{out}: written" if out is not None else "nothing was written; --out writes the rig"
     print_line(f"{end}; check the sentences above against the vehicle")

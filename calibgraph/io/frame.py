@@ -23,7 +23,6 @@ from calibgraph.io.bags import (
     hash_message,
     load_bag_cloud,
     load_bag_image,
-    load_timed_bag_cloud,
 )
 from calibgraph.io.bags.messages import read_message
 from calibgraph.io.clouds import (
@@ -197,7 +196,11 @@ class Frame:
     def _load_cloud(self) -> NDArray[np.float32]:
         path, motion = self.cloud_path, self.motion
         if path.suffix == MESSAGE_SUFFIX:
-            found = with_intensity(load_bag_cloud(path, motion.correct if motion else None))
+            cloud, times_s = load_bag_cloud(path, timed=motion is not None)
+            if motion is not None:
+                taken_s = np.zeros(len(cloud)) if times_s is None else times_s
+                cloud[:, :3] = motion.correct(cloud[:, :3], taken_s)
+            found = with_intensity(cloud)
         else:
             found = self.arrays[path] if path in self.arrays else load_cloud(path, self.columns)
             if motion is not None and (sweep := self.load_sweep()) is not None:
@@ -211,7 +214,7 @@ class Frame:
         """
         path, times_s = self.lidar_paths.get(lidar, self.cloud_path), None
         if path.suffix == MESSAGE_SUFFIX:
-            cloud, times_s = load_timed_bag_cloud(path, self.stamp_ns if timed else None)
+            cloud, times_s = load_bag_cloud(path, timed=timed, start_ns=self.stamp_ns)
         else:
             found = read_returns(path, self.columns if path == self.cloud_path else None)
             cloud = found.points
@@ -246,7 +249,7 @@ class Frame:
         try:
             if path.suffix == MESSAGE_SUFFIX:
                 fields = tuple(each.name for each in read_message(path)[1].fields)
-                cloud = RawCloud(load_bag_cloud(path), fields)
+                cloud = RawCloud(load_bag_cloud(path)[0], fields)
             else:
                 cloud = read_returns(path, self.columns)
         except (CalibrationError, OSError):

@@ -103,8 +103,8 @@ def _camera(lines: "NumberLines", key: str, T_rectified_lidar: Array, image: Pat
     if key not in lines:
         raise IncompleteCamera(lines.path, f"line {key!r} is missing")
     P, where = lines.array(key, 3, 4), f"{lines.path}: {key}"
-    intrinsics, shift = intrinsics_of_matrix(P[:, :3], where), np.eye(4)
-    shift[:3, 3] = np.linalg.solve(P[:, :3], P[:, 3])
+    intrinsics = intrinsics_of_matrix(P[:, :3], where)
+    shift = transform(np.eye(3), np.linalg.solve(P[:, :3], P[:, 3]))
     width, height = image_size(image)
     content = {
         "width_px": width,

@@ -164,9 +164,6 @@ def _from_plain_columns(table: pa.Table) -> Correspondences:
 
     require_no_nulls(table, table.column_names)
 
-    def stack(names: Sequence[str]) -> Array:
-        return np.stack([table[name].to_numpy().astype(np.float64) for name in names], axis=1)
-
     given = table.column_names
     encoded = table["camera"].combine_chunks().dictionary_encode()
     if isinstance(encoded, pa.ChunkedArray):
@@ -175,17 +172,21 @@ def _from_plain_columns(table: pa.Table) -> Correspondences:
         cameras=tuple(encoded.dictionary.to_pylist()),
         camera_index=np.asarray(encoded.indices.to_numpy(zero_copy_only=False), dtype=np.int32),
         frame=_whole(table, "frame"),
-        pixels_px=stack(COORDINATES[:2]),
-        points_lidar_m=stack(COORDINATES[2:]),
+        pixels_px=_stack(table, COORDINATES[:2]),
+        points_lidar_m=_stack(table, COORDINATES[2:]),
         confidence=as_confidence(table["confidence"].to_numpy())
         if "confidence" in given
         else np.ones(len(table), np.float32),
-        information_px=stack(INFORMATION) if INFORMATION[0] in given else None,
-        twist_per_s=stack(TWIST) if TWIST[0] in given else None,
+        information_px=_stack(table, INFORMATION) if INFORMATION[0] in given else None,
+        twist_per_s=_stack(table, TWIST) if TWIST[0] in given else None,
         late_s=table[LATE].to_numpy().astype(np.float64) if LATE in given else None,
         stamp_ns=_whole(table, "stamp_ns") if "stamp_ns" in given else None,
         metadata=json.loads((table.schema.metadata or {}).get(b"matcher", b"{}")),
     )
+
+
+def _stack(table: pa.Table, names: Sequence[str]) -> Array:
+    return np.stack([table[name].to_numpy().astype(np.float64) for name in names], axis=1)
 
 
 def _whole(table: pa.Table, name: str) -> NDArray[np.int64]:
@@ -228,15 +229,12 @@ def _from_arrow(table: pa.Table, path: Path) -> CameraMatches:
     number = {name: index for index, name in enumerate(cameras)}
     index = np.array([[number[name] for name in side] for side in names], np.int32).T
 
-    def stack(columns: tuple[str, ...]) -> Array:
-        return np.stack([np.asarray(table[name].to_numpy(), np.float64) for name in columns], 1)
-
     return CameraMatches(
         cameras=cameras,
         camera_index=index.reshape(-1, 2),
         frame=np.asarray(table["frame"].to_numpy(), np.int64),
-        pixels_px=stack(NUMBERS).reshape(-1, 2, 2),
-        planes_lidar_per_m=stack(PLANES).reshape(-1, 2, 3),
+        pixels_px=_stack(table, NUMBERS).reshape(-1, 2, 2),
+        planes_lidar_per_m=_stack(table, PLANES).reshape(-1, 2, 3),
         metadata=json.loads(metadata.get(b"matcher", b"{}")),
     )
 

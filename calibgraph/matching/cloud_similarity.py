@@ -41,6 +41,7 @@ _MOST_POINTS = 40_000  # of a cloud, chosen at random: more show no more in such
 _LEAST_RANGE_M = 2.5  # nearer points are of the vehicle
 _UPRIGHT_M, _ABOVE_GROUND_M = 0.5, 0.3
 _MOST_VOXELS = 12  # of a cell that count: higher things are no surer
+_GRID = _CELLS, _CELL_M, _MOST_VOXELS
 _ANGLES, _RADII = 120, np.linspace(3.0, 40.0, 32)  # of the spectrum; an angle is 1.5 degrees
 _LIKELY, _VERIFIED = 32, 4  # places whose images, and points, are compared
 _ICP_STEPS, _FIRST_GATE_M, _GATE_SHRINKS, _LAST_GATE_M = 10, 3.0, 0.7, 0.6
@@ -139,10 +140,8 @@ def find_upright(name: str, clouds: Sequence[Array]) -> Array:
             f"LiDAR {name!r} sees no ground, by which its placement is found; write its "
             "T_base_lidar into rig.yaml"
         )
-    T = np.eye(4)
-    T[:3, :3] = Rotation.align_vectors([[0.0, 0.0, 1.0]], normal[None])[0].as_matrix()
-    T[2, 3] = height_m
-    return T
+    turn, _ = Rotation.align_vectors(Z_UP[2:], normal[None])
+    return transform(turn, [0.0, 0.0, height_m])
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,7 +170,7 @@ class UprightCloud:
         chosen = np.random.default_rng(0).random(len(cloud)) * len(cloud) < _MOST_POINTS
         points = np.asarray(cloud[chosen, :3], dtype=np.float64)
         points = _upright_points(points @ R_up_lidar.T)
-        image = _from_above(points)
+        image = image_from_above(points, *_GRID)
         magnitude = np.fft.fftshift(np.abs(np.fft.fft2(image))).astype(np.float32)
         angle = np.arange(_ANGLES)[:, None] * (np.pi / _ANGLES)
         row, column = (_CELLS / 2 + _RADII * f(angle) for f in (np.cos, np.sin))
@@ -226,7 +225,8 @@ def _upright_points(points: Array) -> Array:
     ranges = np.hypot(points[:, 0], points[:, 1])
     near = (ranges > _LEAST_RANGE_M) & (ranges < _REACH_M) & (np.abs(points[:, 2]) < _HEIGHT_M)
     points = points[near]
-    cell, z = _cells(points), points[:, 2]
+    i, j = np.floor(points[:, :2] / _CELL_M).astype(np.int64).T + _CELLS // 2
+    cell, z = i * _CELLS + j, points[:, 2]
     low, high = np.full(_CELLS**2, np.inf), np.full(_CELLS**2, -np.inf)
     np.minimum.at(low, cell, z)
     np.maximum.at(high, cell, z)
@@ -237,16 +237,15 @@ def _upright_points(points: Array) -> Array:
     return points[np.unique((i * side + j) * side + k, return_index=True)[1]]
 
 
-def _cells(points: Array) -> NDArray[np.int64]:
-    """(n,) numbers of the cells that points are in, from above."""
-    i, j = np.floor(points[:, :2] / _CELL_M).astype(np.int64).T + _CELLS // 2
-    return np.asarray(i * _CELLS + j)
+def image_from_above(points: Array, cells: int, cell_m: float, most: float = np.inf) -> Array:
+    """(cells, cells) how much is in each cell, blurred, of mean 0 and unit norm.
 
-
-def _from_above(points: Array) -> Array:
-    """(_CELLS, _CELLS) how much is upright in each cell, blurred, of mean 0 and unit norm."""
-    counts = np.bincount(_cells(points), minlength=_CELLS**2).astype(np.float64)
-    image = np.sqrt(np.minimum(counts, _MOST_VOXELS)).reshape(_CELLS, _CELLS)
+    More than so many points of a cell count no more.
+    """
+    i, j = np.floor(points[:, :2] / cell_m).astype(np.int64).T + cells // 2
+    inside = (i >= 0) & (i < cells) & (j >= 0) & (j < cells)
+    counts = np.bincount(i[inside] * cells + j[inside], minlength=cells**2).astype(np.float64)
+    image = np.sqrt(np.minimum(counts, most)).reshape(cells, cells)
     image = np.asarray(cv2.GaussianBlur(image, (0, 0), 1.0), dtype=np.float64)
     image -= image.mean()
     return np.asarray(image / max(float(np.linalg.norm(image)), _TINY))
@@ -258,7 +257,7 @@ def _correlate(known: UprightCloud, now: UprightCloud, turn: int) -> tuple[float
     for angle in (turn * np.pi / _ANGLES, turn * np.pi / _ANGLES + np.pi):
         T = np.eye(4)
         T[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
-        turned = np.fft.rfft2(_from_above(now.points_m @ T[:3, :3].T))
+        turned = np.fft.rfft2(image_from_above(now.points_m @ T[:3, :3].T, *_GRID))
         correlation = np.fft.irfft2(known.spectrum * turned.conj())
         offset = np.array(np.unravel_index(correlation.argmax(), correlation.shape))
         if correlation.max() > best:
@@ -284,10 +283,9 @@ def _refine(known: UprightCloud, now: UprightCloud, T_known_now: Array) -> Array
 
 def _rigid_fit(source: Array, target: Array) -> Array:
     """(4, 4) that moves (n, 3) points onto others, least squares (Kabsch, 1976)."""
-    means = source.mean(axis=0), target.mean(axis=0)
-    u, _, vt = np.linalg.svd((source - means[0]).T @ (target - means[1]))
-    R = vt.T @ np.diag([1.0, 1.0, np.linalg.det(vt.T @ u.T)]) @ u.T
-    return transform(R, means[1] - R @ means[0])
+    before, after = source.mean(axis=0), target.mean(axis=0)
+    turn, _ = Rotation.align_vectors(target - after, source - before)
+    return transform(turn, after - turn.apply(before))
 
 
 def _share(target: UprightCloud, source: UprightCloud, T_target_source: Array) -> float:

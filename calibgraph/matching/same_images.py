@@ -7,8 +7,8 @@ far, even side by side: over a road that is a shear, which copies do not have.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import combinations
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -33,8 +33,7 @@ a shift of brightness, noise or a crop to half the sides 0.8 and more."""
 _SAME_PX = 6.0  # by which the fits of two frames may differ in a corner
 
 
-@dataclass(frozen=True, eq=False)
-class _View:
+class _View(NamedTuple):
     """A reduced image with its features: (n, 2) places and (n, 32) descriptors."""
 
     gray: NDArray[np.uint8]

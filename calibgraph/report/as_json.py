@@ -20,10 +20,7 @@ def result_summary(result: Calibration, written: list[Path]) -> dict[str, Any]:
     for name, T in result.T_camera_lidar.items():
         cameras[name] = {
             "T_camera_lidar": T.tolist(),
-            "verdict": result.camera_verdicts[name].status,
-            "cannot_tell": result.camera_verdicts[name].cannot_tell,
-            "probability_off": _probability(result.camera_verdicts[name]),
-            "reasons": list(result.camera_verdicts[name].reasons),
+            **_of_verdict(result.camera_verdicts[name]),
             "actions": list(result.summary_of(name).actions),
             **_sigmas(result, name),
             "residuals": _values(result.residuals.get(name)),
@@ -41,19 +38,13 @@ def result_summary(result: Calibration, written: list[Path]) -> dict[str, Any]:
     lidars = {
         name: {
             "T_base_lidar": result.T_base_lidar[name].tolist(),
-            "verdict": verdict.status,
-            "cannot_tell": verdict.cannot_tell,
-            "probability_off": _probability(verdict),
-            "reasons": list(verdict.reasons),
+            **_of_verdict(verdict),
             **_sigmas(result, name),
         }
         for name, verdict in result.lidar_verdicts.items()
     }
     return {
-        "verdict": result.verdict.status,
-        "cannot_tell": result.verdict.cannot_tell,
-        "probability_off": _probability(result.verdict),
-        "reasons": list(result.verdict.reasons),
+        **_of_verdict(result.verdict),
         "summary": asdict(result.summary),
         "warnings": list(result.warnings),
         "places": [list(place) for place in result.places],
@@ -65,8 +56,14 @@ def result_summary(result: Calibration, written: list[Path]) -> dict[str, Any]:
     }
 
 
-def _probability(verdict: Verdict) -> float | None:
-    return None if verdict.error_probability is None else verdict.error_probability.probability
+def _of_verdict(verdict: Verdict) -> dict[str, Any]:
+    doubt = verdict.error_probability
+    return {
+        "verdict": verdict.status,
+        "cannot_tell": verdict.cannot_tell,
+        "probability_off": None if doubt is None else doubt.probability,
+        "reasons": list(verdict.reasons),
+    }
 
 
 def _values(of: object | None) -> dict[str, Any] | None:

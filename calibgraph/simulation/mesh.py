@@ -1,7 +1,6 @@
 """Painted triangles: the solids of a street, and ribbons of ground along a line."""
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from functools import cache
 
 import numpy as np
@@ -16,37 +15,21 @@ _SPLITS, _LEAF_SPLITS = 3, 4
 _BOX_AXES = 0
 
 
-@dataclass(frozen=True, eq=False)
-class Mesh:
-    """Triangles, each with its own corners.
-
-    Attributes:
-        corners_m: (t, 3, 3) in the world.
-        uv_m: (t, 3, 2) the corners' coordinates on the paint.
-        albedo: (t, 4) under the paint.
-        paint: (t,) index of the paint in ``paints``.
-        paints: distinct paints.
-    """
-
-    corners_m: Array
-    uv_m: Array
-    albedo: Array
-    paint: NDArray[np.int64]
-    paints: tuple[Paint, ...]
+TRIANGLE = np.dtype([
+    ("corners_m", "f8", (3, 3)), ("uv_m", "f8", (3, 2)), ("albedo", "f8", 4), ("paint", "f8", 11)
+])  # fmt: skip
+"""A triangle: its corners in the world, their coordinates on the paint, the albedo under it, and
+the numbers of the paint, see :meth:`.paints.Paint.packed`."""
+Mesh = NDArray[np.void]
+"""(t,) of TRIANGLE."""
 
 
-def join_meshes(parts: Iterable[Mesh]) -> Mesh:
-    """Join several meshes; each paint is kept once."""
-    parts = list(parts)
-    index = {paint: i for i, paint in enumerate(dict.fromkeys(p for m in parts for p in m.paints))}
-    new = [np.array([index[paint] for paint in part.paints])[part.paint] for part in parts]
-    return Mesh(
-        corners_m=np.concatenate([part.corners_m for part in parts]),
-        uv_m=np.concatenate([part.uv_m for part in parts]),
-        albedo=np.concatenate([part.albedo for part in parts]),
-        paint=np.concatenate(new),
-        paints=tuple(index),
-    )
+def mesh_of(corners_m: Array, uv_m: Array, albedo: Albedo | Array, paint: Paint) -> Mesh:
+    """The mesh of (t, 3, 3) corners and their (t, 3, 2) places on a paint."""
+    mesh = np.empty(len(corners_m), TRIANGLE)
+    mesh["corners_m"], mesh["uv_m"], mesh["albedo"] = corners_m, uv_m, albedo
+    mesh["paint"] = paint.packed()
+    return mesh
 
 
 def mesh_of_solid(solid: Solid) -> Mesh:
@@ -62,7 +45,7 @@ def mesh_of_solid(solid: Solid) -> Mesh:
     uv = np.take_along_axis(own + np.divide(solid.size_m, 2), axes[:, None, :], axis=2)
     frame = solid.frame
     corners = unit @ frame[:3, :3].T + frame[:3, 3]
-    return _plain(corners, uv + solid.uv_from_m, solid.albedo, solid.paint)
+    return mesh_of(corners, uv + solid.uv_from_m, solid.albedo, solid.paint)
 
 
 def ribbon(
@@ -85,18 +68,13 @@ def ribbon(
     rows = [np.column_stack([line_m[:, :2] + y * line_m[:, 2:], np.full(len(line_m), z)])
             for y, z in edges_m]  # fmt: skip
     places = [np.column_stack([along_m, np.full(len(along_m), y + z)]) for y, z in edges_m]
-    return _plain(_quads(*rows), _quads(*places), albedo, paint)
+    return mesh_of(_quads(*rows), _quads(*places), albedo, paint)
 
 
 def _quads(near: Array, far: Array) -> Array:
     """(2k-2, 3, n) two triangles between each pair of successive points of two rows (k, n)."""
     a, b, c, d = near[:-1], near[1:], far[1:], far[:-1]
     return np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
-
-
-def _plain(corners: Array, uv: Array, albedo: Albedo, paint: Paint) -> Mesh:
-    count = len(corners)
-    return Mesh(corners, uv, np.tile(albedo, (count, 1)), np.zeros(count, np.int64), (paint,))
 
 
 @cache

@@ -11,7 +11,7 @@ import numpy as np
 
 from calibgraph.arrays import Array
 from calibgraph.simulation import paints, solids
-from calibgraph.simulation.mesh import Mesh, join_meshes, mesh_of_solid, ribbon
+from calibgraph.simulation.mesh import Mesh, mesh_of_solid, ribbon
 from calibgraph.simulation.paints import Albedo
 from calibgraph.simulation.solids import Solid, box, cylinder, place
 
@@ -123,7 +123,7 @@ def build_street(line: Centreline, length_m: float, rng: Rng) -> Mesh:
     parts = [*draw_cars(line, length_m, rng), *_backdrop(line, rng)]
     for side in (1, -1):
         parts += [*_houses(line, side, rng), *_roadside(line, side, rng)]
-    return join_meshes([*_ground(line), *map(mesh_of_solid, parts)])
+    return np.concatenate([*_ground(line), *map(mesh_of_solid, parts)])
 
 
 def _ground(line: Centreline) -> Iterator[Mesh]:

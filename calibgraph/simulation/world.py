@@ -71,16 +71,17 @@ def build_world(mesh: Mesh, sun: Array, rng: np.random.Generator) -> World:
         CalibrationError: if Open3D is missing.
     """
     open3d = _open3d()
-    corners = mesh.corners_m.astype(np.float32)
+    corners = mesh["corners_m"].astype(np.float32)
     order = np.arange(3 * len(corners), dtype=np.uint32).reshape(-1, 3)
     scene = open3d.t.geometry.RaycastingScene()
     scene.add_triangles(open3d.core.Tensor(corners.reshape(-1, 3)), open3d.core.Tensor(order))
-    uv = mesh.uv_m
-    table = [_normals(mesh.corners_m), uv[:, 0], uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]]
+    uv = mesh["uv_m"]
+    table = [_normals(mesh["corners_m"]), uv[:, 0], uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]]
+    paints, paint = np.unique(mesh["paint"], axis=0, return_inverse=True)
     return World(
         scene=scene,
-        surfaces=np.column_stack([*table, mesh.albedo, mesh.paint]).astype(np.float32),
-        paints=np.stack([paint.packed() for paint in mesh.paints]),
+        surfaces=np.column_stack([*table, mesh["albedo"], paint.ravel()]).astype(np.float32),
+        paints=paints,
         grain=_noise_texture(rng),
         sun=sun,
     )

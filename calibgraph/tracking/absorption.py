@@ -9,7 +9,7 @@ import numpy as np
 from calibgraph.arrays import Array
 from calibgraph.errors import CorrespondenceError
 from calibgraph.model.correspondences import Correspondences, concatenate
-from calibgraph.model.geometry import invert_each
+from calibgraph.model.geometry import invert
 from calibgraph.model.rig import Rig
 from calibgraph.pipeline import solve
 from calibgraph.solver.columns import distortion_evidence
@@ -96,7 +96,7 @@ def sums_of(state: State, gated: Mapping[int, Gated]) -> Sums:
     hessian = root @ state.curvature[cameras] @ root.swapaxes(1, 2)
     gradient = here.gradient
     if not np.array_equal(poses, to):
-        steps = logarithms(poses @ invert_each(to))
+        steps = logarithms(poses @ invert(to))
         gradient = gradient + (hessian @ steps[..., None])[..., 0]
     return Sums.zeros(len(cameras)).change(
         hessian=hessian,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.model.geometry import invert_each, retract_all
+from calibgraph.model.geometry import invert, retract_all
 from calibgraph.solver.robust import median_norm
 from calibgraph.solver.within_place import WEAK
 from calibgraph.tracking.absorption import add_to_totals, count_epoch, sums_of
@@ -62,7 +62,7 @@ def _newest(state: State, graph: EpochGraph) -> Array:
     for _ in range(_GATE_STEPS if cameras else 0):
         pairs = zip(blocks.values(), at, strict=True)
         found = BlockSums.join([block.summarize(T[None]) for block, T in pairs])
-        moved = older.shift_reference(logarithms(start @ invert_each(at)))
+        moved = older.shift_reference(logarithms(start @ invert(at)))
         pull, whole = found.gradient + moved.gradient, found.hessian + older.hessian + WEAK
         step = np.asarray(-np.linalg.solve(whole, pull[..., None])[..., 0])
         at = retract_all(at, step)
@@ -74,7 +74,7 @@ def _newest(state: State, graph: EpochGraph) -> Array:
 
 def _set_references(state: State, references: Array) -> None:
     """Take all sums about other references."""
-    steps = logarithms(state.references @ invert_each(references))
+    steps = logarithms(state.references @ invert(references))
     state.references = references
     state.sums = state.sums.shift_reference(steps)
     state.places = state.places.shift_reference(steps)

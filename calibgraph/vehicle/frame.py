@@ -49,11 +49,8 @@ class Road(NamedTuple):
     height_sigma_m: float
 
 
-class _Measured(NamedTuple):
-    """(6,) steps of rotation and translation that a source wants, and their information."""
-
-    steps: Array
-    information: Array
+Measured = tuple[Array, Array]
+"""(6,) steps of rotation and translation that a source wants, and their information."""
 
 
 def find_vehicle(
@@ -68,10 +65,10 @@ def find_vehicle(
     """
     T = _start(stated, road, travel)
     for _ in range(_ROUNDS):
-        found = [_by_rig(T, stated), _by_road(T, road), _by_travel(T, travel)]
-        information = np.sum([each.information for each in found], axis=0)
-        wanted = np.sum([each.information * each.steps for each in found], axis=0)
-        step = wanted / np.where(information > 0, information, np.inf)
+        found = _by_rig(T, stated), _by_road(T, road), _by_travel(T, travel)
+        steps, known = np.array(found).transpose(1, 0, 2)
+        information = known.sum(axis=0)
+        step = (known * steps).sum(axis=0) / np.where(information > 0, information, np.inf)
         T = transform(Rotation.from_rotvec(step[:3]).as_matrix() @ T[:3, :3], T[:3, 3] + step[3:])
     with np.errstate(divide="ignore"):
         sigmas = np.maximum(information**-0.5, _LEAST_SIGMA)
@@ -80,12 +77,12 @@ def find_vehicle(
         for axis, sigma in zip(VEHICLE_AXES, sigmas, strict=True)
         if np.isinf(sigma)
     ]
-    known = {
+    content = {
         "T_vehicle_lidar": T,
         "rotation_sigma_rad": tuple(sigmas[:3].tolist()),
         "translation_sigma_m": tuple(sigmas[3:].tolist()),
     }
-    return stated.model_copy(update=known), tuple(notes)
+    return stated.model_copy(update=content), tuple(notes)
 
 
 def find_road(clouds_base_m: Sequence[Array]) -> Road | None:
@@ -131,15 +128,15 @@ def _start(stated: Vehicle, road: Road | None, travel: Travel | None) -> Array:
     return transform(np.array([np.cross(y, z), y, z]))
 
 
-def _by_rig(T: Array, stated: Vehicle) -> _Measured:
+def _by_rig(T: Array, stated: Vehicle) -> Measured:
     if stated.T_vehicle_lidar is None:
-        return _Measured(np.zeros(6), np.zeros(6))
+        return np.zeros(6), np.zeros(6)
     rotation = Rotation.from_matrix(stated.T_vehicle_lidar[:3, :3] @ T[:3, :3].T).as_rotvec()
     steps = np.concatenate([rotation, stated.T_vehicle_lidar[:3, 3] - T[:3, 3]])
-    return _Measured(steps, stated.sigmas**-2.0)
+    return steps, stated.sigmas**-2.0
 
 
-def _by_road(T: Array, road: Road | None) -> _Measured:
+def _by_road(T: Array, road: Road | None) -> Measured:
     """Roll and pitch by which the normal is upright, and the height."""
     steps, information = np.zeros(6), np.zeros(6)
     if road is not None:
@@ -148,10 +145,10 @@ def _by_road(T: Array, road: Road | None) -> _Measured:
         steps[[0, 1, 5]] = y, -x, road.height_m - T[2, 3]
         found = np.array([sigmas[1], sigmas[0], road.height_sigma_m])
         information[[0, 1, 5]] = np.maximum(found, _LEAST_SIGMA) ** -2.0
-    return _Measured(steps, information)
+    return steps, information
 
 
-def _by_travel(T: Array, travel: Travel | None) -> _Measured:
+def _by_travel(T: Array, travel: Travel | None) -> Measured:
     """Pitch and yaw by which the direction of travel is the x axis; x from turns."""
     steps, information = np.zeros(6), np.zeros(6)
     if travel is not None:
@@ -160,7 +157,7 @@ def _by_travel(T: Array, travel: Travel | None) -> _Measured:
         sigmas = np.array([travel.pitch_sigma_rad, travel.yaw_sigma_rad])
         information[1:3] = np.where(sigmas < _TOLD, np.maximum(sigmas, _LEAST_SIGMA) ** -2.0, 0.0)
         steps[3], information[3] = travel.ahead_m - T[0, 3], travel.ahead_sigma_m**-2.0
-    return _Measured(steps, information)
+    return steps, information
 
 
 def _direction(travel: Travel) -> Array:

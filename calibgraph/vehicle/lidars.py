@@ -12,7 +12,7 @@ the covariance is wider by that.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import permutations
 
@@ -23,8 +23,8 @@ from scipy.spatial.transform import Rotation
 
 from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError
-from calibgraph.vehicle.planes import Planes, Views
-from calibgraph.vehicle.sums import Matches, Sums, sum_up
+from calibgraph.vehicle.planes import Planes, Views, moved
+from calibgraph.vehicle.sums import MATCH, Matches, Sums, residuals_m, sum_up
 
 _GATES_M = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18, 0.13)  # of the residuals, while the poses converge
 _LAST_GATE_M, _MOST_ROUNDS = 0.1, 25
@@ -108,7 +108,7 @@ def calibrate_lidars(
     T, _ = refine_poses(planes, T, names)
     places = [_at_place([of[i : i + 1] for of in planes], T, names) for i in range(len(planes[0]))]
     step, joint, ratios = combine_places(places, place_sigmas)
-    T = _moved(T, step)
+    T = _stepped(T, step)
     near, on = count_matched(planes, T)
     return LidarPoses(
         base,
@@ -160,7 +160,7 @@ def refine_poses(
         _require_overlap(matches, names)
         sums = sum_up(matches, T, _scale_m(matches, 0.0 if is_last else _WIDTH * gate_m))
         step = _step(sums)
-        T = _moved(T, step)
+        T = _stepped(T, step)
         if is_last and np.abs(step).max() < _CONVERGED:
             break
     return T, sums
@@ -170,7 +170,7 @@ def _distinct(planes: Sequence[Planes]) -> list[int]:
     """The instants of which the base sees upright planes elsewhere than at those before."""
     kept: list[int] = []
     for number, own in enumerate(planes):
-        up = np.linalg.eigh(own.normals.T @ own.normals)[1][:, 2]  # most planes are ground
+        up = np.linalg.eigh(own["normal"].T @ own["normal"])[1][:, 2]  # most planes are ground
         stands = False
         for other in kept:
             near, on = count_matched([[planes[other]], [own]], np.array([np.eye(4)] * 2), up=up)
@@ -180,7 +180,7 @@ def _distinct(planes: Sequence[Planes]) -> list[int]:
     return kept
 
 
-def _moved(T_base_lidar: Array, steps: Array) -> Array:
+def _stepped(T_base_lidar: Array, steps: Array) -> Array:
     """(k, 4, 4) poses after (6 (k - 1),) steps of all but the base."""
     T = T_base_lidar.copy()
     for pose, step in zip(T[1:], steps.reshape(-1, 6), strict=True):
@@ -191,34 +191,32 @@ def _moved(T_base_lidar: Array, steps: Array) -> Array:
 
 def _match(
     planes: Sequence[Sequence[Planes]], T_base_lidar: Array, gate_m: float, cosine: float
-) -> list[Matches]:
+) -> Matches:
     """Each plane with the nearest one of every other LiDAR, if that can be the same."""
-    found = []
-    for place, one, other, of, to in _nearest(planes, T_base_lidar):
-        apart = of.centers_m - to.centers_m
-        across = (to.normals * apart).sum(axis=1)
-        along = np.sqrt(np.maximum((apart**2).sum(axis=1) - across**2, 0.0))
-        same = (along < np.maximum(of.radii_m, to.radii_m)) & (np.abs(across) < gate_m)
-        same &= (of.normals * to.normals).sum(axis=1) > cosine
-        if same.any():
-            found.append(Matches(place, one, other, of.select(same), to.select(same)))
-    return found
+    found = _nearest(planes, T_base_lidar)
+    plane, other = found["plane"], found["of_other"]
+    apart = plane["center_m"] - other["center_m"]
+    across = (other["normal"] * apart).sum(axis=1)
+    along = np.sqrt(np.maximum((apart**2).sum(axis=1) - across**2, 0.0))
+    same = (along < np.maximum(plane["radius_m"], other["radius_m"])) & (np.abs(across) < gate_m)
+    same &= (plane["normal"] * other["normal"]).sum(axis=1) > cosine
+    return np.asarray(found[same])
 
 
-def _nearest(
-    planes: Sequence[Sequence[Planes]], T_base_lidar: Array
-) -> Iterator[tuple[int, int, int, Planes, Planes]]:
-    """Per place and ordered pair of LiDARs, planes of one and the nearest of the other in reach."""
+def _nearest(planes: Sequence[Sequence[Planes]], T_base_lidar: Array) -> Matches:
+    """Of each place and ordered pair of LiDARs, planes of one and the nearest of the other."""
+    found = [np.empty(0, MATCH)]
     for place, seen in enumerate(zip(*planes, strict=True)):
-        here = [own.moved(T) for own, T in zip(seen, T_base_lidar, strict=True)]
-        trees = [cKDTree(own.centers_m) if len(own) else None for own in here]
+        here = [moved(own, T) for own, T in zip(seen, T_base_lidar, strict=True)]
+        trees = [cKDTree(own["center_m"]) for own in here]
         for one, other in permutations(range(len(here)), 2):
-            tree, of, to = trees[other], here[one], here[other]
-            if tree is None or not len(of):
-                continue
-            away, nearest = tree.query(of.centers_m, distance_upper_bound=_REACH_M)
+            away, nearest = trees[other].query(here[one]["center_m"], distance_upper_bound=_REACH_M)
             rows = np.flatnonzero(np.isfinite(away))
-            yield place, one, other, of.select(rows), to.select(nearest[rows])
+            own = np.empty(len(rows), MATCH)
+            own["place"], own["one"], own["other"] = place, one, other
+            own["plane"], own["of_other"] = here[one][rows], here[other][nearest[rows]]
+            found.append(own)
+    return np.concatenate(found)
 
 
 def count_matched(
@@ -228,36 +226,39 @@ def count_matched(
 
     With (3,) ``up`` in the base frame only those that are upright.
     """
-    near, on = np.zeros(len(T_base_lidar)), np.zeros(len(T_base_lidar))
-    for _, one, other, of, to in _nearest(planes, T_base_lidar):
-        apart = of.centers_m - to.centers_m
-        beside = (apart**2).sum(axis=1) < np.maximum(of.radii_m, to.radii_m) ** 2
-        if up is not None:
-            beside &= np.abs(of.normals @ up) < _UPRIGHT
-        across = np.abs((to.normals * apart).sum(axis=1)) < _LAST_GATE_M
-        on_it = beside & across & ((of.normals * to.normals).sum(axis=1) > _FINE_COSINE)
-        for number in (one, other):
-            near[number] += beside.sum()
-            on[number] += on_it.sum()
+    found = _nearest(planes, T_base_lidar)
+    plane, other = found["plane"], found["of_other"]
+    apart = plane["center_m"] - other["center_m"]
+    beside = (apart**2).sum(axis=1) < np.maximum(plane["radius_m"], other["radius_m"]) ** 2
+    if up is not None:
+        beside &= np.abs(plane["normal"] @ up) < _UPRIGHT
+    on_it = beside & (np.abs((other["normal"] * apart).sum(axis=1)) < _LAST_GATE_M)
+    on_it &= (plane["normal"] * other["normal"]).sum(axis=1) > _FINE_COSINE
+    near, on = (_per_lidar(found[of], len(T_base_lidar)) for of in (beside, on_it))
     return near, on
 
 
-def _require_overlap(matches: Sequence[Matches], names: Sequence[str]) -> None:
+def _per_lidar(matches: Matches, count: int) -> Array:
+    """(k,) how many matches each LiDAR has a part in."""
+    both = np.concatenate([matches["one"], matches["other"]])
+    return np.bincount(both, minlength=count).astype(np.float64)
+
+
+def _require_overlap(matches: Matches, names: Sequence[str]) -> None:
     """One line if a LiDAR has too few matches."""
-    for number, name in enumerate(names):
-        count = sum(len(own.planes) for own in matches if number in (own.one, own.other))
+    for name, count in zip(names, _per_lidar(matches, len(names)), strict=True):
         if count < _LEAST_MATCHES:
             raise CalibrationError(
-                f"LiDAR {name!r} sees {count} planes that others see, at least {_LEAST_MATCHES} "
-                "are needed; check its guess T_base_lidar (p_base = T_base_lidar * p_lidar), or "
-                "record where walls and ground are in view of both"
+                f"LiDAR {name!r} sees {count:.0f} planes that others see, at least "
+                f"{_LEAST_MATCHES} are needed; check its guess T_base_lidar (p_base = "
+                "T_base_lidar * p_lidar), or record where walls and ground are in view of both"
             )
 
 
-def _scale_m(matches: Sequence[Matches], least_m: float) -> float:
+def _scale_m(matches: Matches, least_m: float) -> float:
     """Width of the Cauchy loss: as residuals spread."""
-    every = np.concatenate([own.residuals_m[0] for own in matches])
-    return max(2.0 * 1.4826 * float(np.median(np.abs(every))), _LEAST_SCALE_M, least_m)
+    spread_m = 1.4826 * float(np.median(np.abs(residuals_m(matches)[0])))
+    return max(2.0 * spread_m, _LEAST_SCALE_M, least_m)
 
 
 def _step(sums: Sums) -> Array:

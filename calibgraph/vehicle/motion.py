@@ -24,7 +24,7 @@ from calibgraph.io.bags import MESSAGE_SUFFIX
 from calibgraph.io.frame import Frame, ScanSteps, twist_by_scans
 from calibgraph.model.geometry import invert, move_points
 from calibgraph.vehicle.lidars import refine_poses
-from calibgraph.vehicle.planes import Planes, View, find_planes, join_planes
+from calibgraph.vehicle.planes import Planes, View, find_planes, moved, thinned
 from calibgraph.vehicle.travel import read_poses
 from factors import displace
 
@@ -108,10 +108,10 @@ class Drive:
             if not instant.is_usable:
                 continue
             cloud = instant.at_stamp(base, np.eye(4))
-            own = find_planes(cloud).thinned(_MOST_PLANES)
+            own = thinned(find_planes(cloud), _MOST_PLANES)
             T = drift[other > number] @ T_odometry  # as that of the one beside it
             if planes:
-                known, both = join_planes(planes), np.array([np.eye(4), T])
+                known, both = np.concatenate(planes), np.array([np.eye(4), T])
                 try:
                     (_, T), sums = refine_poses([[known], [own]], both, (base, base), first=_FIRST)
                 except CalibrationError:  # too few planes
@@ -120,10 +120,10 @@ class Drive:
                     continue
                 drift[other > number] = T @ invert(T_odometry)
             points.append(move_points(cloud, T))
-            planes.append(own.moved(T))
+            planes.append(moved(own, T))
         if len(planes) <= 1:
             return None
-        return View(np.concatenate(points), join_planes(planes)), max(T_map_base)
+        return View(np.concatenate(points), np.concatenate(planes)), max(T_map_base)
 
     def _around(self, number: int) -> dict[int, Array]:
         """(4, 4) T_number_frame of frames some metres apart; empty if they end before the reach."""

@@ -8,7 +8,6 @@ were measured, if they spread in two directions.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,42 +27,24 @@ _SPREAD = 0.04  # of the same over the squared radius
 _FLAT, _ROUGH_M = 0.01, 0.08  # most variance across a plane over the least along it; most roughness
 
 
-@dataclass(frozen=True, eq=False)
-class Planes:
-    """Pieces of planes.
-
-    Attributes:
-        centers_m: (n, 3) means of their points.
-        normals: (n, 3) unit vectors, towards the LiDAR.
-        radii_m: (n,) of the neighbourhoods.
-        tilts: (n,) by how much a normal may err [rad]: roughness over the least extent.
-    """
-
-    centers_m: Array
-    normals: Array
-    radii_m: Array
-    tilts: Array
-
-    def __len__(self) -> int:
-        return len(self.radii_m)
-
-    def select(self, rows: NDArray[Any]) -> Planes:
-        """Some of them: a mask, or an index array."""
-        return Planes(
-            self.centers_m[rows], self.normals[rows], self.radii_m[rows], self.tilts[rows]
-        )
-
-    def thinned(self, most: int) -> Planes:
-        """At most so many of them."""
-        return self.select(np.arange(0, len(self), max(-(-len(self) // most), 1)))
-
-    def moved(self, T_base_lidar: Array) -> Planes:
-        """The same in another frame, by (4, 4)."""
-        centers, normals = move_points(self.centers_m, T_base_lidar), self.normals
-        return replace(self, centers_m=centers, normals=normals @ T_base_lidar[:3, :3].T)
+PLANE = np.dtype([("center_m", "f8", 3), ("normal", "f8", 3), ("radius_m", "f8"), ("tilt", "f8")])
+"""A piece of a plane: the mean of its points, a unit vector towards the LiDAR, the radius of the
+neighbourhood, and by how much the normal may err [rad]: roughness over the least extent."""
+Planes = NDArray[np.void]
+"""(n,) of PLANE."""
 
 
-_NONE = Planes(np.empty((0, 3)), np.empty((0, 3)), np.empty(0), np.empty(0))
+def thinned(planes: Planes, most: int) -> Planes:
+    """At most so many of them."""
+    return planes[:: max(-(-len(planes) // most), 1)]
+
+
+def moved(planes: Planes, T_base_lidar: Array) -> Planes:
+    """The same in another frame, by (4, 4)."""
+    found = planes.copy()
+    found["center_m"] = move_points(planes["center_m"], T_base_lidar)
+    found["normal"] = planes["normal"] @ T_base_lidar[:3, :3].T
+    return found
 
 
 class View(NamedTuple):
@@ -94,24 +75,16 @@ def find_planes(points_lidar_m: Array) -> Planes:
     points = np.asarray(points_lidar_m[:, :3], dtype=np.float64)
     ranges = np.linalg.norm(points, axis=1)
     points = points[(ranges > _NEAREST_M) & (ranges < _FARTHEST_M)]
-    left, found, tree = _seeds(points), [_NONE], None
+    left, found, tree = _seeds(points), [np.empty(0, PLANE)], None
     for share in _SHARES:
         if not len(left):
             break
         tree = tree or cKDTree(points)
         radii = np.clip(share * np.linalg.norm(left, axis=1), _LEAST_M, _LARGEST_M)
         own, is_plane, spreads = _fit(points, tree.query_ball_point(left, radii), radii)
-        found.append(own.select(is_plane))
+        found.append(own[is_plane])
         left = left[~spreads]
-    return join_planes(found)
-
-
-def join_planes(parts: Sequence[Planes]) -> Planes:
-    """All planes of several clouds, in one frame."""
-    fields = zip(
-        *([getattr(each, key) for key in Planes.__annotations__] for each in parts), strict=True
-    )
-    return Planes(*map(np.concatenate, fields))
+    return np.concatenate(found)
 
 
 def _seeds(points: Array) -> Array:
@@ -146,4 +119,7 @@ def _fit(
     normals = vectors[:, :, 0]
     normals = normals * np.where((normals * centers).sum(axis=1) > 0, -1.0, 1.0)[:, None]
     tilts = np.sqrt(np.maximum(across, 0.0) / np.maximum(least, np.finfo(float).tiny))
-    return Planes(centers, normals, radii, tilts), is_plane, spreads
+    planes = np.empty(len(radii), PLANE)
+    for name, values in zip(PLANE.names or (), (centers, normals, radii, tilts), strict=True):
+        planes[name] = values
+    return planes, is_plane, spreads

@@ -12,18 +12,17 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError
-from calibgraph.matching.cloud_similarity import find_upright
-from calibgraph.model.geometry import angle_deg, invert, move_points
+from calibgraph.matching.cloud_similarity import find_upright, image_from_above
+from calibgraph.model.geometry import angle_deg, invert, move_points, transform
 from calibgraph.vehicle.lidars import count_matched, refine_poses
-from calibgraph.vehicle.planes import Planes, View, Views, join_planes
+from calibgraph.vehicle.planes import Planes, View, Views, moved, thinned
 
-_CELLS, _CELL_M = 192, 0.5  # of an image from above
+_GRID = _CELLS, _CELL_M = 192, 0.5  # of an image from above
 _FROM_M, _TO_M = 0.4, 6.0  # over the ground: what is upright
 _STEP_DEG = 3.0  # between headings
 _APART_M = 12.0  # of two LiDARs of one vehicle
@@ -66,13 +65,6 @@ class _Placement(NamedTuple):
         return self.on * self.share**_POWER
 
 
-class _Near(NamedTuple):
-    """(4, 4) near whose rotation, and near whose position placements are sought; None: any."""
-
-    turn: Array | None
-    place: Array | None
-
-
 _Placed = Mapping[str, tuple[_Seen, Array]]
 """LiDARs whose (4, 4) T_base_lidar is known."""
 
@@ -105,8 +97,8 @@ def locate_lidars(
         found = {}
         for name in left:
             place = None if name in turned else guess[name]
-            near = _Near(guess[name], place)
-            tried = _placements(seen[name], placed, seen[base].T_up_lidar, near)
+            up = seen[base].T_up_lidar
+            tried = _placements(seen[name], placed, up, turn=guess[name], guess=place)
             found[name], doubts[name] = _best(tried, place)
         lost = _why_lost(found, [*placed])
         placed |= {name: (seen[name], of.T) for name, of in found.items() if of.is_sure}
@@ -130,12 +122,17 @@ def _why_lost(found: Mapping[str, _Placement], placed: Sequence[str]) -> str:
 
 def _look(name: str, views: Sequence[View]) -> _Seen:
     points = [view.points_m for view in views]
-    some = [view.planes.thinned(_MOST_PLANES) for view in views]
+    some = [thinned(view.planes, _MOST_PLANES) for view in views]
     return _Seen(points, some, find_upright(name, points))
 
 
-def _placements(own: _Seen, placed: _Placed, T_up_base: Array, near: _Near) -> list[_Placement]:
-    """Refined placements that differ: of the guess, and of peaks of the images from above."""
+def _placements(
+    own: _Seen, placed: _Placed, T_up_base: Array, *, turn: Array | None, guess: Array | None
+) -> list[_Placement]:
+    """Refined placements that differ: of the guess, and of peaks of the images from above.
+
+    Near the rotation of one (4, 4), and the position of another, if there are any.
+    """
     headings, offsets, score = _correlate(own, placed, T_up_base)
 
     def away(T_base_lidar: Array) -> tuple[Array, Array]:
@@ -145,32 +142,31 @@ def _placements(own: _Seen, placed: _Placed, T_up_base: Array, near: _Near) -> l
         at = np.linalg.norm(offsets - T[:2, 3], axis=-1)
         return np.abs((turned + 180.0) % 360.0 - 180.0), at
 
-    guess = near.place
-    if near.turn is not None:
-        score[away(near.turn)[0] > _NEAR_DEG] = -np.inf
+    if turn is not None:
+        score[away(turn)[0] > _NEAR_DEG] = -np.inf
     if guess is not None:
         score[:, away(guess)[1] > _NEAR_M] = -np.inf
     known = [
-        join_planes([of.planes[i].moved(T) for of, T in placed.values()])
+        np.concatenate([moved(of.planes[i], T) for of, T in placed.values()])
         for i in range(len(own.planes))
     ]
     found, similar = list[_Placement](), np.zeros(len(headings))
-    slides = near.turn is not None and guess is None
+    slides = turn is not None and guess is None
     for number in range(_TRIED_ALONG if slides else _TRIED):
-        turn, i, j = np.unravel_index(int(score.argmax()), score.shape)
-        T = _turn(headings[turn])
+        heading, i, j = np.unravel_index(int(score.argmax()), score.shape)
+        T = _turn(headings[heading])
         T[:2, 3] = offsets[i, j]
         start = invert(T_up_base) @ T @ own.T_up_lidar
         if guess is not None and number == 0:
             start = guess
-        elif np.isinf(score[turn, i, j]):
+        elif np.isinf(score[heading, i, j]):
             break
         refined = _refined(known, own.planes, start, T_up_base[2, :3])
         found += [each for each in refined if guess is None or _is_near(each.T, guess)]
         for T in (start, *(each.T for each in refined)):
             angles, shifted = away(T)
             score[(angles <= _PEAK_DEG)[:, None, None] & (shifted <= _PEAK_M)] = -np.inf
-        if near.turn is None:
+        if turn is None:
             similar += away(start)[0] <= _BAND_DEG
             score[similar >= _PER_HEADING] = -np.inf
     return found
@@ -181,12 +177,14 @@ def _correlate(own: _Seen, placed: _Placed, T_up_base: Array) -> tuple[Array, Ar
     known, upright = [], []
     for instant, cloud in enumerate(own.clouds):
         clouds = [move_points(of.clouds[instant], T_up_base @ T) for of, T in placed.values()]
-        known.append(np.fft.rfft2(_from_above(_upright_points(np.concatenate(clouds)))))
+        known.append(
+            np.fft.rfft2(image_from_above(_upright_points(np.concatenate(clouds)), *_GRID))
+        )
         upright.append(_upright_points(move_points(cloud, own.T_up_lidar)))
     maps, headings = [], np.arange(0.0, 360.0, _STEP_DEG)
     for heading in headings:
         products = [
-            one * np.fft.rfft2(_from_above(move_points(two, _turn(heading)))).conj()
+            one * np.fft.rfft2(image_from_above(move_points(two, _turn(heading)), *_GRID)).conj()
             for one, two in zip(known, upright, strict=True)
         ]
         maps.append(np.fft.irfft2(np.sum(products, axis=0)))
@@ -198,9 +196,7 @@ def _correlate(own: _Seen, placed: _Placed, T_up_base: Array) -> tuple[Array, Ar
 
 
 def _turn(heading_deg: float) -> Array:
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_euler("z", heading_deg, degrees=True).as_matrix()
-    return T
+    return transform(Rotation.from_euler("z", heading_deg, degrees=True))
 
 
 def _upright_points(points_up_m: Array) -> Array:
@@ -209,16 +205,6 @@ def _upright_points(points_up_m: Array) -> Array:
     points = points[np.hypot(points[:, 0], points[:, 1]) < _CELLS * _CELL_M / 2]
     i, j, k = np.floor(points / _CELL_M).astype(np.int64).T + 2 * _CELLS
     return points[np.unique((i * 4 * _CELLS + j) * 4 * _CELLS + k, return_index=True)[1]]
-
-
-def _from_above(points_m: Array) -> Array:
-    """(_CELLS, _CELLS) how much is in each cell, blurred; of mean 0 and unit norm."""
-    i, j = np.floor(points_m[:, :2] / _CELL_M).astype(np.int64).T + _CELLS // 2
-    inside = (i >= 0) & (i < _CELLS) & (j >= 0) & (j < _CELLS)
-    counts = np.bincount(i[inside] * _CELLS + j[inside], minlength=_CELLS**2).astype(np.float64)
-    image = np.asarray(cv2.GaussianBlur(np.sqrt(counts).reshape(_CELLS, _CELLS), (0, 0), 1.0))
-    image -= image.mean()
-    return np.asarray(image / max(float(np.linalg.norm(image)), float(np.finfo(float).tiny)))
 
 
 def _refined(

@@ -15,7 +15,6 @@ only the directions count in which H is near what it would be if normals did not
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,7 +22,7 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
-from calibgraph.vehicle.planes import Planes
+from calibgraph.vehicle.planes import PLANE
 
 CELL_M = 4.0
 """Edge of the cells within which residuals err alike: the independent units."""
@@ -34,27 +33,19 @@ _RELIABLE = 0.8  # of H over H without errors of normals: at places that determi
 _DETERMINED = 0.1  # of the same, over all pairs
 
 
-@dataclass(frozen=True, eq=False)
-class Matches:
-    """Matched planes of two LiDARs at one place, all in the base frame.
+MATCH = np.dtype([
+    ("place", "i8"), ("one", "i8"), ("other", "i8"), ("plane", PLANE), ("of_other", PLANE)
+])  # fmt: skip
+"""A plane of a LiDAR and one of another, both in the base frame; numbers of place and LiDARs."""
+Matches = NDArray[np.void]
+"""(m,) of MATCH."""
 
-    Attributes:
-        place: its number.
-        one, other: numbers of the LiDARs.
-        planes, others: (m) of each.
-    """
 
-    place: int
-    one: int
-    other: int
-    planes: Planes
-    others: Planes
-
-    @property
-    def residuals_m(self) -> tuple[Array, Array]:
-        """(m,) by the other's normals, and by their own."""
-        apart = self.planes.centers_m - self.others.centers_m
-        return (self.others.normals * apart).sum(axis=1), (self.planes.normals * apart).sum(axis=1)
+def residuals_m(matches: Matches) -> Array:
+    """(2, m) by the other's normals, and by their own."""
+    plane, other = matches["plane"], matches["of_other"]
+    apart = plane["center_m"] - other["center_m"]
+    return np.stack([(each["normal"] * apart).sum(axis=1) for each in (other, plane)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,13 +68,15 @@ class Sums:
         return np.asarray(vectors[:, values > _DETERMINED])
 
 
-def sum_up(matches: Sequence[Matches], T_base_lidar: Array, scale_m: float) -> Sums:
+def sum_up(matches: Matches, T_base_lidar: Array, scale_m: float) -> Sums:
     """The sums with the weights of a Cauchy loss of a width [m], at poses (k, 4, 4)."""
     steps, rows = _twists_by_steps(T_base_lidar), []
     metric = np.zeros((6 * len(T_base_lidar), 6 * len(T_base_lidar)))
-    pairs = sorted({(m.place, *sorted((m.one, m.other))) for m in matches})
-    for place, one, other in pairs:
-        own = [m for m in matches if m.place == place and {m.one, m.other} == {one, other}]
+    both = np.sort(np.column_stack([matches["one"], matches["other"]]), axis=1)
+    pairs = np.column_stack([matches["place"], both])
+    for pair in np.unique(pairs, axis=0):
+        place, one, other = pair.tolist()
+        own = matches[(pairs == pair).all(axis=1)]
         cells, hessian, gradient, whole = _of_pair(own, one, scale_m)
         by = steps[one] - steps[other]
         metric += by.T @ whole @ by
@@ -112,40 +105,32 @@ def _twists_by_steps(T_base_lidar: Array) -> Array:
 
 def _cross_matrix(vectors: Array) -> Array:
     """(n, 3, 3) of (n, 3), with matrix @ x = vector cross x."""
-    matrix = np.zeros((len(vectors), 3, 3))
-    for i, j, k, sign in ((0, 1, 2, -1.0), (1, 2, 0, -1.0), (2, 0, 1, -1.0)):
-        matrix[:, i, j], matrix[:, j, i] = sign * vectors[:, k], -sign * vectors[:, k]
-    return matrix
+    return np.cross(np.eye(3), vectors[:, None])
 
 
 def _of_pair(
-    matches: Sequence[Matches], one: int, scale_m: float
+    own: Matches, one: int, scale_m: float
 ) -> tuple[NDArray[np.int64], Array, Array, Array]:
     """Numbers of cells (c,), their H (c, 6, 6) and g (c, 6) by the twist of one against the other.
 
     And H of all, (6, 6), as if normals did not err.
     """
-    cells, hessians, gradients = [], [], []
-    whole = np.zeros((6, 6))
-    for own in matches:
-        points, others = own.planes.centers_m, own.others.centers_m
-        by_others, by_own = own.residuals_m
-        weight = 1.0 / (1.0 + 0.5 * (by_others**2 + by_own**2) / scale_m**2)
-        a = np.hstack([np.cross(points, own.others.normals), own.others.normals])
-        b = np.hstack([np.cross(others, own.planes.normals), own.planes.normals])
-        every = np.concatenate([_cross_matrix(points), np.tile(np.eye(3), (len(points), 1, 1))], 1)
-        across = every @ every.transpose(0, 2, 1) - a[:, :, None] * a[:, None, :]
-        shared = 0.5 * (own.planes.tilts**2 + own.others.tilts**2)
-        product = a[:, :, None] * b[:, None, :]
-        whole += 0.5 * ((a.T * weight) @ a + (b.T * weight) @ b)
-        hessian = 0.5 * (product + product.transpose(0, 2, 1)) - shared[:, None, None] * across
-        gradient = 0.5 * (b * by_others[:, None] + a * by_own[:, None])
-        hessians.append(weight[:, None, None] * hessian)
-        gradients.append(weight[:, None] * gradient * (1.0 if own.one == one else -1.0))
-        cells.append(np.floor(points / CELL_M).astype(np.int64) @ _CELL_NUMBERS)
-    named, row = np.unique(np.concatenate(cells), return_inverse=True)
-    hessian, gradient = np.concatenate(hessians), np.concatenate(gradients)
-    return named, _added(row.ravel(), hessian), _added(row.ravel(), gradient), whole
+    plane, other, (by_other, by_own) = own["plane"], own["of_other"], residuals_m(own)
+    points, weight = plane["center_m"], 1.0 / (1.0 + 0.5 * (by_other**2 + by_own**2) / scale_m**2)
+    a = np.hstack([np.cross(points, other["normal"]), other["normal"]])
+    b = np.hstack([np.cross(other["center_m"], plane["normal"]), plane["normal"]])
+    every = np.concatenate([_cross_matrix(points), np.tile(np.eye(3), (len(points), 1, 1))], 1)
+    across = every @ every.transpose(0, 2, 1) - a[:, :, None] * a[:, None, :]
+    shared = 0.5 * (plane["tilt"] ** 2 + other["tilt"] ** 2)
+    product = a[:, :, None] * b[:, None, :]
+    whole = 0.5 * ((a.T * weight) @ a + (b.T * weight) @ b)
+    hessian = 0.5 * (product + product.transpose(0, 2, 1)) - shared[:, None, None] * across
+    gradient = 0.5 * (b * by_other[:, None] + a * by_own[:, None])
+    gradient *= (weight * np.where(own["one"] == one, 1.0, -1.0))[:, None]
+    cells = np.floor(points / CELL_M).astype(np.int64) @ _CELL_NUMBERS
+    named, row = np.unique(cells, return_inverse=True)
+    hessian = _added(row.ravel(), weight[:, None, None] * hessian)
+    return named, hessian, _added(row.ravel(), gradient), whole
 
 
 def _added(rows: NDArray[np.int64], values: Array) -> Array:

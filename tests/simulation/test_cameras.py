@@ -1,7 +1,5 @@
 """Simulated cameras: the inverse of every lens, and the images."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +12,7 @@ from calibgraph.simulation.cameras import (
     trace_light,
 )
 from calibgraph.simulation.lidar import scan
-from calibgraph.simulation.mesh import join_meshes, mesh_of_solid
+from calibgraph.simulation.mesh import mesh_of_solid
 from calibgraph.simulation.recording import Drive
 from calibgraph.simulation.solids import ellipsoid
 from calibgraph.simulation.world import build_world, cast
@@ -68,7 +66,9 @@ def test_a_ball_is_where_the_lens_projects_it(lens: str, place_m: tuple[float, .
     T_world_camera = invert(camera.T_camera_lidar)
     empty, full = (
         trace_light(
-            build_world(join_meshes(map(mesh_of_solid, solids)), sun, rng), rays, T_world_camera
+            build_world(np.concatenate([*map(mesh_of_solid, solids)]), sun, rng),
+            rays,
+            T_world_camera,
         )
         for solids in ((far,), (far, ball))
     )

@@ -181,9 +181,10 @@ def test_the_centre_of_a_plane_lies_on_it_and_single_rings_are_no_planes():
     rng = np.random.default_rng(0)
     cloud = scan(flat_street(), transform(np.eye(3), [0.0, 0.0, 1.8]), rng, noise_m=0.0)
     planes = find_planes(cloud)
-    ground = np.abs(planes.normals[:, 2]) > 0.9
+    ground = np.abs(planes["normal"][:, 2]) > 0.9
     assert ground.any() and not ground.all()
-    off = np.abs(planes.centers_m[:, 2] + 1.8), np.abs(np.abs(planes.centers_m[:, 1]) - 8.0)
+    _, y, z = planes["center_m"].T
+    off = np.abs(z + 1.8), np.abs(np.abs(y) - 8.0)
     assert np.mean(np.minimum(*off) < 1e-6) > 0.9, "but for those in the corner of both"
     ring = np.column_stack(
         [*(5 * f(np.linspace(0, 6, 500)) for f in (np.cos, np.sin)), -np.ones(500)]

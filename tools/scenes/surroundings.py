@@ -4,14 +4,12 @@ Few of them have the walls, corners and poles that a calibration lives on. Frame
 :mod:`calibgraph.simulation.street`; the lane at ``LANE_Y_M`` is free in all of them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.simulation.mesh import Mesh, join_meshes, mesh_of_solid, ribbon
+from calibgraph.simulation.mesh import Mesh, mesh_of, mesh_of_solid, ribbon
 from calibgraph.simulation.paints import (
     ASPHALT,
     BARK,
@@ -61,7 +59,7 @@ def build_meadow(line: Centreline, length_m: float, rng: Rng) -> Mesh:
     pole = place_along(
         line, [cylinder((0, 0, 0), (0.2, 0.2, 7.5), BARK)], s, side * 6.5, yaw_deg=0, body=BARK
     )
-    return join_meshes([*parts, *map(mesh_of_solid, pole)])
+    return np.concatenate([*parts, *map(mesh_of_solid, pole)])
 
 
 def build_motorway(line: Centreline, length_m: float, rng: Rng) -> Mesh:
@@ -73,7 +71,7 @@ def build_motorway(line: Centreline, length_m: float, rng: Rng) -> Mesh:
             rail = box((2.0, 0, 0.5), (4.0, 0.06, 0.3), STEEL)
             rails += place_along(line, [post, rail], s, side * KERB_Y_M, yaw_deg=0, body=STEEL)
     cars = _traffic(line, length_m, rng)
-    return join_meshes(
+    return np.concatenate(
         [*_countryside(line, rng, ROAD, trees=0.08), *map(mesh_of_solid, [*rails, *cars])]
     )
 
@@ -93,7 +91,7 @@ def build_tunnel(line: Centreline, length_m: float, rng: Rng) -> Mesh:
     for s in line.along_m[[0, -1]]:
         wall = box((0, 0, 0), (1.0, 40.0, _TUNNEL_M + 1), CONCRETE)
         solids += place_along(line, [wall], s, 0, yaw_deg=0, body=CONCRETE)
-    return join_meshes([*parts, *map(mesh_of_solid, solids)])
+    return np.concatenate([*parts, *map(mesh_of_solid, solids)])
 
 
 def build_deck(line: Centreline, length_m: float, rng: Rng) -> Mesh:
@@ -115,7 +113,7 @@ def build_deck(line: Centreline, length_m: float, rng: Rng) -> Mesh:
                 line, [column], s, y / line.layout.width, yaw_deg=0, body=CONCRETE
             )
     solids += draw_cars(line, length_m, rng)
-    return join_meshes([*parts, *map(mesh_of_solid, solids)])
+    return np.concatenate([*parts, *map(mesh_of_solid, solids)])
 
 
 def build_quay(line: Centreline, length_m: float, rng: Rng) -> Mesh:
@@ -133,7 +131,7 @@ def build_quay(line: Centreline, length_m: float, rng: Rng) -> Mesh:
     for s in np.arange(line.along_m[0], line.along_m[-1], 6.0):
         bollard = cylinder((0, 0, 0), (0.35, 0.35, 0.8), STEEL)
         rail += place_along(line, [bollard], s, wet * (KERB_Y_M + 2.4), yaw_deg=0, body=STEEL)
-    return join_meshes([*parts, *map(mesh_of_solid, rail)])
+    return np.concatenate([*parts, *map(mesh_of_solid, rail)])
 
 
 SURROUNDINGS: Mapping[str, SceneBuilder] = {
@@ -194,7 +192,7 @@ def _foliage(centre_m: tuple[float, float, float], size_m: Array, rng: Rng) -> M
     corners = middle[:, None] + _LEAF_M * rng.standard_normal((count, 3, 3))
     light = np.exp(0.25 * rng.standard_normal((count, 1)))
     uv = rng.uniform(0, 9, (count, 1, 2)) + np.array([[0, 0], [_LEAF_M, 0], [0, _LEAF_M]])
-    return Mesh(corners, uv, np.asarray(LEAVES) * light, np.zeros(count, np.int64), (LEAFY,))
+    return mesh_of(corners, uv, np.asarray(LEAVES) * light, LEAFY)
 
 
 def _traffic(line: Centreline, length_m: float, rng: Rng) -> Iterator[Solid]:

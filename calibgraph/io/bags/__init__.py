@@ -4,7 +4,6 @@ The rest of the package reads a message as it reads a file: by the path that is 
 """
 
 import hashlib
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -20,33 +19,24 @@ from calibgraph.io.bags.storage import BagOptions as BagOptions
 from calibgraph.io.bags.storage import is_bag as is_bag
 from calibgraph.io.bags.transforms import stamp_ns_of
 
-Correction = Callable[[NDArray[np.float32], Array], Array]
-"""Of (n, 3) points for motion, by (n,) times after the stamp [s]."""
 
+def load_bag_cloud(
+    path: Path, *, timed: bool = False, start_ns: int | None = None
+) -> tuple[NDArray[np.float32], Array | None]:
+    """(n, 4) the cloud in the message with this address, and (n,) its points' times, if asked.
 
-def load_bag_cloud(path: Path, correct: Correction | None = None) -> NDArray[np.float32]:
-    """(n, 4) the cloud in the message with this address, corrected for motion if it is given."""
+    They are seconds after a stamp, by default its own; None if points have no times.
+    """
     content = read_message(path)[1]
-    if correct is None:
-        cloud = cloud_from_message(content, str(path))
-    else:
+    if timed:
         cloud, times_s = timed_points_of(content, str(path))
-        cloud[:, :3] = correct(cloud[:, :3], np.zeros(len(cloud)) if times_s is None else times_s)
+    else:
+        cloud, times_s = cloud_from_message(content, str(path)), None
     if not len(cloud):
         raise FileError(path, "holds no point")
-    return cloud
-
-
-def load_timed_bag_cloud(
-    path: Path, start_ns: int | None
-) -> tuple[NDArray[np.float32], Array | None]:
-    """(n, 4) the cloud in a message, and its points' times [s] after another stamp, if any."""
-    content = read_message(path)[1]
-    if start_ns is None:
-        return load_bag_cloud(path), None
-    cloud, times_s = timed_points_of(content, str(path))
-    late_s = (stamp_ns_of(content) - start_ns) / 1e9
-    return cloud, None if times_s is None else times_s + late_s
+    if times_s is not None and start_ns is not None:
+        times_s = times_s + (stamp_ns_of(content) - start_ns) / 1e9
+    return cloud, times_s
 
 
 def scan_duration_s(path: Path) -> float | None:

@@ -17,6 +17,7 @@ from calibgraph.io.lenses import (
     lens_model,
     listed_intrinsics,
 )
+from calibgraph.model.geometry import transform
 from calibgraph.model.rig import Camera
 from factors import LensModel
 
@@ -45,10 +46,7 @@ class StatedLens:
 
     def T_image_frame(self, *, with_baseline: bool) -> Array:
         """(4, 4) from the frame to the image; with the baseline where the frame is the first's."""
-        T = np.eye(4)
-        T[:3, :3] = self.R_image_frame
-        T[:3, 3] = self.baseline_m if with_baseline else 0.0
-        return T
+        return transform(self.R_image_frame, self.baseline_m if with_baseline else np.zeros(3))
 
     def agrees(self, other: StatedLens) -> bool:
         """Whether it is the same but for what a calibration leaves open: some drivers jitter."""

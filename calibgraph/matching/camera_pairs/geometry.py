@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 from scipy.special import gammaln
 
 from calibgraph.arrays import Array
@@ -163,13 +164,7 @@ def relative_pose(points_a_m: Array, rays_b: Array, *, seed: int) -> Array | Non
 
 def turn_to_axis(rays: Array) -> Array:
     """(3, 3) the shortest rotation that takes the mean ray to the z axis."""
-    mean = rays.mean(axis=0)
-    x, y, z = mean / max(float(np.linalg.norm(mean)), np.finfo(float).tiny)
-    vector = np.array([y, -x, 0.0])  # mean x axis
-    sine = float(np.linalg.norm(vector))
-    if sine < 1e-12:  # noqa: PLR2004
-        return np.diag([1.0, np.sign(z) or 1.0, np.sign(z) or 1.0])
-    return np.asarray(cv2.Rodrigues(vector / sine * math.atan2(sine, z))[0])
+    return np.asarray(Rotation.align_vectors([0.0, 0.0, 1.0], rays.mean(axis=0))[0].as_matrix())
 
 
 NEIGHBOURS = 24

@@ -247,8 +247,6 @@ def log_likelihood(scores: ShiftScores) -> Callable[[Array], Array]:
     Args:
         scores: of one camera, at ``FAR``, about the pose in question.
     """
-    if not len(scores.weights):
-        return lambda twists: np.zeros(len(twists))
     amplitude = max(z_score(scores, np.zeros(6)), 0.0)
     factor = amplitude / (CHANCE_VARIANCE * (scores.chance_sigma + 1e-12))
     return lambda twists: factor * sum_scores(scores, twists)

@@ -7,7 +7,7 @@ guess, and not on its position. The global search reads its z-scores from these 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -147,10 +147,15 @@ def correlate(
     cells = images[0].log_gray.size
     max_windows = max(1, min(max_windows, MAX_CELLS // (cells * len(grays))))
     stride = DENSE_SPACINGS if dense else STRIDE_SPACINGS
-    draw = max_windows, seed
-    cut = partial(_cut_windows_in_reach, range_rad=range_rad, stride=stride, draw=draw)
-    one = partial(_correlate_frame, camera=camera, cut=cut)
-    frames = list(cores.map(one, images, clouds))
+    cut = partial(
+        _cut_windows_in_reach,
+        camera=camera, range_rad=range_rad, stride=stride, max_windows=max_windows, seed=seed,
+    )  # fmt: skip
+
+    def correlate_frame(image: _AngularImage, cloud: PreparedCloud) -> CorrelationMaps:
+        return _correlate_frame(image, cloud, cut(image, cloud), camera)
+
+    frames = list(cores.map(correlate_frame, images, clouds))
     return CorrelationMaps(
         np.concatenate([frame.maps for frame in frames]),
         np.concatenate([frame.points_lidar_m for frame in frames]),
@@ -160,14 +165,9 @@ def correlate(
 
 
 def _correlate_frame(
-    image: _AngularImage,
-    cloud: PreparedCloud,
-    *,
-    camera: Camera,
-    cut: Callable[[_AngularImage, PreparedCloud, Camera], Windows],
+    image: _AngularImage, cloud: PreparedCloud, windows: Windows, camera: Camera
 ) -> CorrelationMaps:
-    """The maps of one frame, of windows that are cut so."""
-    windows = cut(image, cloud, camera)
+    """The maps of the windows of one frame."""
     if not len(windows.counts):
         nothing = np.zeros((0, *image.inside.shape), np.float32)
         return CorrelationMaps(nothing, np.zeros((0, 3)), image.origin_rad, float(STEP_RAD))
@@ -187,16 +187,14 @@ def _correlate_frame(
 def _cut_windows_in_reach(
     image: _AngularImage,
     cloud: PreparedCloud,
-    camera: Camera,
     *,
+    camera: Camera,
     range_rad: float,
     stride: float,
-    draw: tuple[int, int],
+    max_windows: int,
+    seed: int,
 ) -> Windows:
-    """Windows of the part of the cloud that the camera may see from anywhere in the range.
-
-    They are drawn by their largest number and a seed.
-    """
+    """Windows of the part of the cloud that the camera may see from anywhere in the range."""
     R, origin = camera.T_camera_lidar[:3, :3], image.origin_rad
     rays_m = (cloud.points_lidar_m - cloud.viewpoint_lidar_m(camera)) @ R.T
     angles = view_angles(rays_m)
@@ -207,7 +205,7 @@ def _cut_windows_in_reach(
         distance_m = np.linalg.norm(rays_m[near], axis=1)
         near[near] = find_visible(angles[near], distance_m, STEP_RAD / 2)
     table = cloud.windows(camera, near, STEP_RAD, stride, fine=False)
-    return table.cut(near, near, max_covered=1.0, max_windows=draw[0], seed=draw[1])
+    return table.cut(near, near, max_covered=1.0, max_windows=max_windows, seed=seed)
 
 
 def _score_maps(

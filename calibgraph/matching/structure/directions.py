@@ -1,12 +1,9 @@
 """Directions: view angles of a camera, and one direction per cell of the sphere."""
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
-from factors.compiled import compiled
 
 Rows = NDArray[np.intp]
 
@@ -53,49 +50,14 @@ def thin(angles: Array, cell_rad: float) -> Rows:
     """
     if not len(angles):
         return np.empty(0, np.intp)
-    lowest, highest = (math.floor(f(angles[:, 1]) / cell_rad) for f in (np.min, np.max))
-    cosine = np.cos((np.arange(highest - lowest + 1) + float(lowest) + 0.5) * cell_rad)
-    cells, off = np.empty((len(angles), 2), np.intp), np.empty(len(angles))
-    first, last = _find_cells(np.ascontiguousarray(angles), cell_rad, lowest, cosine, cells, off)
-    nearest = np.full((len(cosine), last - first + 1), -1, np.int32)
-    rows = np.empty(len(angles) + 1, np.intp)
-    return rows[: _find_nearest(cells, off, first, nearest, rows)]
-
-
-@compiled()
-def _find_cells(angles, cell, lowest, cosine, cells, off):  # type: ignore[no-untyped-def]
-    """Fill each direction's cell (row, column), and its squared distance from the centre.
-
-    Returns:
-        The first and the last column.
-    """
-    first, last = 1 << 62, -1
-    for i in range(len(angles)):
-        up = angles[i, 1] / cell
-        floor = math.floor(up)
-        row = floor - lowest
-        along = (angles[i, 0] + math.pi) * cosine[row] / cell
-        column = math.floor(along)
-        x, y = along - column - 0.5, up - floor - 0.5
-        cells[i, 0], cells[i, 1], off[i] = row, column, x * x + y * y
-        first, last = min(first, column), max(last, column)
-    return first, last
-
-
-@compiled()
-def _find_nearest(cells, off, first, nearest, rows):  # type: ignore[no-untyped-def]
-    """Fill in by cell the number of its nearest direction; of equally near ones, the first.
-
-    Returns:
-        How many there are.
-    """
-    for i in range(len(cells)):
-        row, column = cells[i, 0], cells[i, 1] - first
-        before = nearest[row, column]
-        if before < 0 or off[i] < off[before]:
-            nearest[row, column] = i
-    count = np.int64(0)
-    for number in nearest.ravel():  # most are empty: a branch would be mispredicted
-        rows[count] = number
-        count += number >= 0
-    return count
+    up = angles[:, 1] / cell_rad
+    row = np.floor(up)
+    along = (angles[:, 0] + np.pi) * np.cos((row + 0.5) * cell_rad) / cell_rad
+    column = np.floor(along)
+    off = (along - column - 0.5) ** 2 + (up - row - 0.5) ** 2
+    row, column = row - row.min(), column - column.min()
+    cells = (row * (column.max() + 1) + column).astype(np.intp)
+    nearest = np.full(cells.max() + 1, np.inf)
+    np.minimum.at(nearest, cells, off)
+    rows = np.flatnonzero(off == nearest[cells])
+    return rows[np.unique(cells[rows], return_index=True)[1]]  # of equally near ones, the first

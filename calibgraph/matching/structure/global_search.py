@@ -10,23 +10,22 @@ no pose of a camera is accepted, it has not been found: the best of the rejected
 taken.
 """
 
-from collections.abc import Callable, Mapping
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
+from calibgraph.arrays import Array
 from calibgraph.matching.structure.acceptance import least_z_score
 from calibgraph.matching.structure.bodies import place_member, rigid_bodies
 from calibgraph.matching.structure.box_search import CANDIDATES
-from calibgraph.matching.structure.pose_refinement import CameraFrames, Candidate
+from calibgraph.matching.structure.pose_refinement import Candidate
 from calibgraph.matching.structure.pose_search import (
     ROLLS_RAD,
     PoseSearch,
-    SearchRange,
     distinct,
     is_accepted,
     is_same_pose,
 )
-from calibgraph.model.rig import Camera, Rig
+from calibgraph.model.findings import MatcherFindings
 from calibgraph.progress import Progress
 
 SEARCHES = 2  # per body
@@ -37,45 +36,10 @@ TRIES = {1: len(ROLLS_RAD), 2: (1 + RETRY_EFFORT) * len(ROLLS_RAD)}
 ALONE = 1 / CANDIDATES  # the same of a single pose
 
 
-@dataclass(frozen=True, eq=False)
-class Located:
-    """The result of the search for one camera.
-
-    Attributes:
-        camera: at its best pose.
-        z_score: agreement of image and cloud there, in standard deviations of chance agreement; of
-            the whole body.
-        accepted: whether that is far better than by chance.
-        chance: the probability that a search with nothing to find ends as high; in few frames
-            alone, where an accepted camera is at its pose by the fine levels.
-        contradicted_by: a camera that sees it elsewhere, while image and cloud of both are accepted
-            where they are; empty without.
-    """
-
-    camera: Camera
-    z_score: float
-    accepted: bool
-    chance: float | None = None
-    contradicted_by: str = ""
-
-
-def locate_cameras(
-    rig: Rig,
-    frames: Mapping[str, CameraFrames],
-    search_range: SearchRange,
-    *,
-    seed: int,
-    out_of_time: Callable[[], bool],
-    pool: Executor,
-    progress: Progress,
-) -> dict[str, Located]:
-    """Locate all cameras of a rig.
-
-    Returns:
-        The best pose per camera, accepted if the camera has been located.
-    """
-    search = PoseSearch(rig, frames, search_range, seed=seed, out_of_time=out_of_time)
-    return Locator(search, pool, progress).locate()
+Found = tuple[dict[str, Array], MatcherFindings]
+"""(4, 4) T_camera_lidar of the cameras that are located; per camera the z-score of its body, where
+that is far better than by chance and where it is not, in few frames the probability by chance, and
+a camera that sees it elsewhere, while image and cloud of both are accepted where they are."""
 
 
 class Locator:
@@ -99,8 +63,8 @@ class Locator:
         self.located: dict[str, Candidate] = {}
         self.contradictions: list[tuple[Candidate, Candidate]] = []
 
-    def locate(self) -> dict[str, Located]:
-        """Locate all bodies, as far as time allows."""
+    def locate(self) -> Found:
+        """Locate all cameras of a rig, as far as time allows."""
         self._report("trying the guess")
         for name, body in self._bodies.items():
             guesses = distinct(place_member(body, n, self._search.guess[n]) for n in body)
@@ -236,21 +200,22 @@ class Locator:
         done = sum(SEARCHES if n in self.located else k for n, k in self._searches.items())
         self._progress(what, min(done, total), total)
 
-    def _result(self) -> dict[str, Located]:
-        found = {name: self.located.get(name, self.best[name]) for name in self._bodies}
-        doubts: dict[str, str] = {}
-        for pair in self.contradictions:
-            if all(one in self.located.values() for one in pair):  # and neither has moved since
-                one, two = (next(iter(each.body)) for each in pair)
-                doubts |= {one: two, two: one}
-        return {
-            member: Located(
-                camera,
-                found[name].z_score,
-                name in self.located,
-                found[name].chance,
-                doubts.get(name, ""),
-            )
-            for name in self._bodies
-            for member, camera in found[name].body.items()
-        }
+    def _result(self) -> Found:
+        T, missed, chance = dict[str, Array](), dict[str, float](), dict[str, float]()
+        found, contradicted = dict[str, float](), dict[str, str]()
+        for name, best in {**self.best, **self.located}.items():
+            z_scores = dict.fromkeys(best.body, best.z_score)
+            if name in self.located:
+                T |= {member: camera.T_camera_lidar for member, camera in best.body.items()}
+                found |= z_scores
+            else:
+                missed |= {member: max(0.0, z_score) for member, z_score in z_scores.items()}
+            if best.chance is not None:
+                chance |= dict.fromkeys(best.body, best.chance)
+        for one, two in self.contradictions:
+            if {one, two} <= {*self.located.values()}:  # and neither has moved since
+                for each, other in ((one, two), (two, one)):
+                    contradicted |= dict.fromkeys(each.body, next(iter(other.body)))
+        return T, MatcherFindings(
+            found=found, missed=missed, chance=chance, contradicted=contradicted
+        )

@@ -4,6 +4,7 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, Future
 from copy import copy
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -17,10 +18,10 @@ from calibgraph.io.frame import Frame
 from calibgraph.matching.protocol import Start
 from calibgraph.matching.structure.consensus import find_consensus
 from calibgraph.matching.structure.frame_cache import FrameCache, cache_of, load_camera_frames
-from calibgraph.matching.structure.global_search import Located, locate_cameras
+from calibgraph.matching.structure.global_search import Locator
 from calibgraph.matching.structure.peaks import extract_correspondences
 from calibgraph.matching.structure.pose_refinement import CONFIDENT
-from calibgraph.matching.structure.pose_search import SearchRange
+from calibgraph.matching.structure.pose_search import PoseSearch, SearchRange
 from calibgraph.matching.structure.schedule import LEVELS, Level
 from calibgraph.matching.structure.shift_scores import (
     ShiftScores,
@@ -123,21 +124,18 @@ class StructureMatcher:
         if self.search_range is None:
             return Start(rig)
         with core_pool() as cores, Threads(len(rig.cameras)) as pool:
-            candidates = locate_cameras(
-                rig,
-                load_camera_frames(cache, frames, rig, cores),
-                self.search_range,
-                seed=self.seed,
-                out_of_time=out_of_time,
-                pool=pool,
-                progress=progress,
+            seen = load_camera_frames(cache, frames, rig, cores)
+            search = PoseSearch(
+                rig, seen, self.search_range, seed=self.seed, out_of_time=out_of_time
             )
-        located = {n: c.camera.T_camera_lidar for n, c in candidates.items() if c.accepted}
-        return Start(
-            rig.moved_to({**rig.T_camera_lidar, **located}),
-            first_round=self._first_round(candidates),
-            findings=_search_findings(candidates, self.search_range),
+            located, findings = Locator(search, pool, progress).locate()
+        findings = replace(
+            findings,
+            range_rotation_deg=self.search_range.rotation_deg,
+            range_translation_m=self.search_range.translation_m,
         )
+        start = rig.moved_to({**rig.T_camera_lidar, **located})
+        return Start(start, self._first_round(findings), findings)
 
     def match(
         self, dataset: Dataset, rig: Rig, *, round_index: int, progress: Progress
@@ -185,11 +183,12 @@ class StructureMatcher:
         cache.keep_only(dataset.frames)
         return cache
 
-    def _first_round(self, candidates: Mapping[str, Located]) -> int:
+    def _first_round(self, of_search: MatcherFindings) -> int:
         if self.estimate:  # the search's pose makes up for errors of the rig's lens and clock
             return 0
-        confident = all(c.accepted and c.z_score >= CONFIDENT for c in candidates.values())
-        looked_at = any(c.accepted and c.chance is not None for c in candidates.values())
+        found, missed = of_search.found, of_search.missed
+        confident = not missed and min(found.values()) >= CONFIDENT
+        looked_at = not of_search.chance.keys().isdisjoint(found)
         return min(_ROUND_AFTER_SEARCH, self.rounds - 1) if confident or looked_at else 0
 
     def _submit_scores(
@@ -261,21 +260,6 @@ class StructureMatcher:
             "window_weights": window_network().origin,
         }
         return {STAGE1: self.stage1, **settings, **findings.to_metadata()}
-
-
-def _search_findings(
-    candidates: Mapping[str, Located], search_range: SearchRange
-) -> MatcherFindings:
-    return MatcherFindings(
-        found={n: c.z_score for n, c in candidates.items() if c.accepted},
-        missed={n: max(0.0, c.z_score) for n, c in candidates.items() if not c.accepted},
-        chance={n: c.chance for n, c in candidates.items() if c.chance is not None},
-        contradicted={
-            n: c.contradicted_by for n, c in candidates.items() if c.accepted and c.contradicted_by
-        },
-        range_rotation_deg=search_range.rotation_deg,
-        range_translation_m=search_range.translation_m,
-    )
 
 
 def _to_search_range(search_deg: float | None, search_m: float | None) -> SearchRange | None:

@@ -26,8 +26,6 @@ def extract_correspondences(
     is an edge) times the mean score of its windows at the peak, their quality. The confidence is
     twice the quality, and at least twice MIN_QUALITY, which a solve keeps by default.
     """
-    if not len(scores.weights):  # nothing of the cloud is in view
-        return _no_correspondences(camera)
     shift, hessian, peak = find_local_peaks(scores.grids, scores.jacobian @ unknowns)
     quality = np.maximum(peak / scores.weights, 0.0)  # 0: no peak
     good = quality > min_quality
@@ -42,16 +40,6 @@ def extract_correspondences(
         points_lidar_m=scores.points_lidar_m[good],
         confidence=np.clip(2 * quality[good], 2 * MIN_QUALITY, 1.0),
         information_px=information[good],
-    )
-
-
-def _no_correspondences(camera: str) -> Correspondences:
-    return Correspondences.from_arrays(
-        camera=camera,
-        frame=np.empty(0, np.int64),
-        pixels_px=np.empty((0, 2)),
-        points_lidar_m=np.empty((0, 3)),
-        information_px=np.empty((0, 3)),
     )
 
 
@@ -72,7 +60,7 @@ def find_local_peaks(grids: Grids, centre: Array) -> tuple[Array, Array, Array]:
     span = np.arange(-PEAK_STEPS, PEAK_STEPS + 1)
     index = np.arange(len(grids))[:, None, None]
     rows, columns = base[:, 1, None, None] + span[:, None], base[:, 0, None, None] + span
-    top = grids[index, rows, columns].reshape(len(grids), -1).argmax(axis=1)
+    top = grids[index, rows, columns].reshape(len(grids), len(span) ** 2).argmax(axis=1)
     row = base[:, 1] + span[top // len(span)]
     column = base[:, 0] + span[top % len(span)]
     around = np.arange(-1, 2)

@@ -31,7 +31,7 @@ from calibgraph.matching.structure.pose_refinement import (
     refine_on,
 )
 from calibgraph.model.geometry import pose_difference, relative_transform, transform
-from calibgraph.model.rig import Camera, Rig
+from calibgraph.model.rig import Rig
 
 SEARCH_WINDOWS, DENSE_WINDOWS = 2100, 9000  # of the maps, per camera over all frames
 FEW_EFFORT = 2
@@ -67,7 +67,7 @@ class SearchRange:
 
 
 class PoseSearch:
-    """Tries poses of bodies, see :func:`locate_cameras`.
+    """Tries poses of bodies, see :class:`.global_search.Locator`.
 
     Attributes:
         report: called with what is being done.
@@ -250,27 +250,24 @@ class PoseSearch:
 
     def _correlate(self, body: Body, effort: int) -> BodyMaps:
         """The maps of those cameras that the clouds are in view of."""
-        maps = {name: self._correlate_camera(name, camera, effort) for name, camera in body.items()}
-        of_lead = lead(body).T_camera_lidar
-        seen = [name for name, one in maps.items() if len(one.maps)]
-        return BodyMaps(
-            [maps[name] for name in seen],
-            [relative_transform(body[name].T_camera_lidar, of_lead) for name in seen],
-        )
-
-    def _correlate_camera(self, name: str, camera: Camera, effort: int) -> CorrelationMaps:
-        frames = self._frames[name]
         windows = DENSE_WINDOWS if self._few else SEARCH_WINDOWS
-        return correlate(
-            frames.grays,
-            frames.clouds,
-            camera,
-            frames.cores,
-            range_rad=self._range.rotation_rad,
-            max_windows=effort * windows // len(frames.grays),
-            dense=self._few,
-            seed=self._seed + 1000 * (effort - 1),
-        )
+        maps, T_camera_lead, of_lead = list[CorrelationMaps](), [], lead(body).T_camera_lidar
+        for name, camera in body.items():
+            frames = self._frames[name]
+            found = correlate(
+                frames.grays,
+                frames.clouds,
+                camera,
+                frames.cores,
+                range_rad=self._range.rotation_rad,
+                max_windows=effort * windows // len(frames.grays),
+                dense=self._few,
+                seed=self._seed + 1000 * (effort - 1),
+            )
+            if len(found.maps):
+                maps.append(found)
+                T_camera_lead.append(relative_transform(camera.T_camera_lidar, of_lead))
+        return BodyMaps(maps, T_camera_lead)
 
 
 def is_same_pose(one: Body, two: Body) -> bool:

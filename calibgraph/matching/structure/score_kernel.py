@@ -182,40 +182,22 @@ def _score_windows(pixels, shape, windows, origin, likelihood, room, grids, by_c
                 out = totals[(row - origin[1]) * padded + first - origin[0] + column :]
                 strip = (lines, stride, padded)
                 if likelihood:
-                    _add_points(pixels, starts, basis[w], n - 1, strip, sums)
-                    _multiply_factors(last, basis[w, n - 1], strip, sums, numbers, inside, out)
+                    _add_points(pixels, starts, basis[w], n - 1, strip, sums, False)
+                    _take_sums(last, basis[w, n - 1], strip, sums, numbers, inside, out, False)
                 else:
-                    _add_points_with_trend(pixels, starts, basis[w], n - 1, strip, sums)
-                    _add_scores(last, basis[w, n - 1], strip, sums, numbers, inside, out)
+                    _add_points(pixels, starts, basis[w], n - 1, strip, sums, True)
+                    _take_sums(last, basis[w, n - 1], strip, sums, numbers, inside, out, True)
     if held:
         _take_totals(totals, padded, likelihood, grids[group[-1]])
 
 
 # Parts are inlined: of one that is not, a process that compiles it runs other code than a later
-# process, and with fastmath other sums.
+# process, and with fastmath other sums. And so ``with_trend`` is a constant where they are called.
 @compiled(part=True, fastmath=True, forceinline=True)
-def _add_points(pixels, starts, basis, count, strip, sums):  # type: ignore[no-untyped-def]
-    """Add points to the sums of a strip: along depth and intensity, plain, and squared."""
+def _add_points(pixels, starts, basis, count, strip, sums, with_trend):  # type: ignore[no-untyped-def]
+    """Add points to the sums of a strip: along depth and intensity, plain, squared, and a trend."""
     lines, stride, _ = strip
-    for p in range(0, count, POINTS):
-        s0, s1, s2, s3 = starts[p], starts[p + 1], starts[p + 2], starts[p + 3]
-        a0, a1, a2, a3 = basis[p, 0], basis[p + 1, 0], basis[p + 2, 0], basis[p + 3, 0]
-        b0, b1, b2, b3 = basis[p, 1], basis[p + 1, 1], basis[p + 2, 1], basis[p + 3, 1]
-        for line in range(lines):
-            for k in range(LANES):
-                at, m = line * stride + k, line * SUMS * LANES + k
-                x0, x1 = pixels[_index(s0 + at)], pixels[_index(s1 + at)]
-                x2, x3 = pixels[_index(s2 + at)], pixels[_index(s3 + at)]
-                sums[_index(m)] += a0 * x0 + a1 * x1 + a2 * x2 + a3 * x3
-                sums[_index(m + LANES)] += b0 * x0 + b1 * x1 + b2 * x2 + b3 * x3
-                sums[_index(m + 2 * LANES)] += x0 + x1 + x2 + x3
-                sums[_index(m + 3 * LANES)] += x0 * x0 + x1 * x1 + x2 * x2 + x3 * x3
-
-
-@compiled(part=True, fastmath=True, forceinline=True)
-def _add_points_with_trend(pixels, starts, basis, count, strip, sums):  # type: ignore[no-untyped-def]
-    """As :func:`_add_points`, and along both columns of the trend."""
-    lines, stride, _ = strip
+    width = (SUMS_WITH_TREND if with_trend else SUMS) * LANES
     for p in range(0, count, POINTS):
         s0, s1, s2, s3 = starts[p], starts[p + 1], starts[p + 2], starts[p + 3]
         a0, a1, a2, a3 = basis[p, 0], basis[p + 1, 0], basis[p + 2, 0], basis[p + 3, 0]
@@ -224,57 +206,44 @@ def _add_points_with_trend(pixels, starts, basis, count, strip, sums):  # type: 
         d0, d1, d2, d3 = basis[p, 3], basis[p + 1, 3], basis[p + 2, 3], basis[p + 3, 3]
         for line in range(lines):
             for k in range(LANES):
-                at, m = line * stride + k, line * SUMS_WITH_TREND * LANES + k
+                at, m = line * stride + k, line * width + k
                 x0, x1 = pixels[_index(s0 + at)], pixels[_index(s1 + at)]
                 x2, x3 = pixels[_index(s2 + at)], pixels[_index(s3 + at)]
                 sums[_index(m)] += a0 * x0 + a1 * x1 + a2 * x2 + a3 * x3
                 sums[_index(m + LANES)] += b0 * x0 + b1 * x1 + b2 * x2 + b3 * x3
                 sums[_index(m + 2 * LANES)] += x0 + x1 + x2 + x3
                 sums[_index(m + 3 * LANES)] += x0 * x0 + x1 * x1 + x2 * x2 + x3 * x3
-                sums[_index(m + 4 * LANES)] += c0 * x0 + c1 * x1 + c2 * x2 + c3 * x3
-                sums[_index(m + 5 * LANES)] += d0 * x0 + d1 * x1 + d2 * x2 + d3 * x3
+                if with_trend:
+                    sums[_index(m + 4 * LANES)] += c0 * x0 + c1 * x1 + c2 * x2 + c3 * x3
+                    sums[_index(m + 5 * LANES)] += d0 * x0 + d1 * x1 + d2 * x2 + d3 * x3
 
 
 @compiled(part=True, fastmath=True, forceinline=True)
-def _multiply_factors(pixels, basis, strip, sums, numbers, inside, out):  # type: ignore[no-untyped-def]
-    """Add the last point of a window, multiply the factors of the strip, and clear its sums."""
+def _take_sums(pixels, basis, strip, sums, numbers, inside, out, with_trend):  # type: ignore[no-untyped-def]
+    """Add the last point of a window; add the scores, or multiply the factors; clear the sums."""
     (lines, stride, padded), (over, noise, chance) = strip, numbers
-    a, b = basis[0], basis[1]
+    width = (SUMS_WITH_TREND if with_trend else SUMS) * LANES
+    a, b, c, d = basis[0], basis[1], basis[2], basis[3]
     for line in range(lines):
         for k in range(LANES):
-            x, m = pixels[_index(line * stride + k)], line * SUMS * LANES + k
+            x, m = pixels[_index(line * stride + k)], line * width + k
             depth, intensity = sums[_index(m)] + a * x, sums[_index(m + LANES)] + b * x
             total, square = sums[_index(m + 2 * LANES)] + x, sums[_index(m + 3 * LANES)] + x * x
             sums[_index(m)] = sums[_index(m + LANES)] = 0
             sums[_index(m + 2 * LANES)] = sums[_index(m + 3 * LANES)] = 0
             variation = square - total * total * over + noise
+            if with_trend:
+                u, v = sums[_index(m + 4 * LANES)] + c * x, sums[_index(m + 5 * LANES)] + d * x
+                sums[_index(m + 4 * LANES)] = sums[_index(m + 5 * LANES)] = 0
+                variation = variation - u * u - v * v
             explained = depth * depth + intensity * (
                 intensity if intensity > 0 else OPPOSITE * intensity
             )
-            share = (explained + chance * noise) / variation - chance
-            out[_index(line * padded + k)] *= np.float32(1) - inside[_index(k)] * share * _TO_FACTOR
-
-
-@compiled(part=True, fastmath=True, forceinline=True)
-def _add_scores(pixels, basis, strip, sums, numbers, inside, out):  # type: ignore[no-untyped-def]
-    """As :func:`_multiply_factors`, with the trend, and the scores are added."""
-    (lines, stride, padded), (over, noise, chance) = strip, numbers
-    a, b, c, d = basis[0], basis[1], basis[2], basis[3]
-    for line in range(lines):
-        for k in range(LANES):
-            x, m = pixels[_index(line * stride + k)], line * SUMS_WITH_TREND * LANES + k
-            depth, intensity = sums[_index(m)] + a * x, sums[_index(m + LANES)] + b * x
-            total, square = sums[_index(m + 2 * LANES)] + x, sums[_index(m + 3 * LANES)] + x * x
-            u, v = sums[_index(m + 4 * LANES)] + c * x, sums[_index(m + 5 * LANES)] + d * x
-            sums[_index(m)] = sums[_index(m + LANES)] = 0
-            sums[_index(m + 2 * LANES)] = sums[_index(m + 3 * LANES)] = 0
-            sums[_index(m + 4 * LANES)] = sums[_index(m + 5 * LANES)] = 0
-            variation = square - total * total * over + noise - u * u - v * v
-            explained = depth * depth + intensity * (
-                intensity if intensity > 0 else OPPOSITE * intensity
-            )
-            share = (explained + chance * noise) / variation - chance
-            out[_index(line * padded + k)] += inside[_index(k)] * share
+            share = inside[_index(k)] * ((explained + chance * noise) / variation - chance)
+            if with_trend:
+                out[_index(line * padded + k)] += share
+            else:
+                out[_index(line * padded + k)] *= np.float32(1) - share * _TO_FACTOR
 
 
 @compiled(part=True, fastmath=True, forceinline=True)

@@ -30,8 +30,7 @@ class WindowTable:
         rays_m: (m, 3) from the viewpoint to points of the cloud, along the axes of the LiDAR frame.
         intensity_rank: (m,) of the points.
         angles: (m, 2) azimuth and elevation of their rays.
-        rows: (m,) their rows in the cloud; None: all. Windows of all are kept when they are cut,
-            for later poses and cameras.
+        rows: (m,) their rows in the cloud; None: all.
         spacing_rad: of the points in a window.
         stride_spacings: of the windows, in spacings of the points.
         keep_linear: keep the linear parts of the variation.
@@ -50,15 +49,16 @@ class WindowTable:
     ) -> None:
         kept = thin(angles, spacing_rad)
         centres = thin(angles[kept], stride_spacings * spacing_rad)
-        own_pages = mmap_copy if rows is None else np.asarray
         self._cloud, self._cloud_rows = (rays_m, intensity_rank), rows
-        self._rows = own_pages(kept.astype(np.int32))
-        self._centres = own_pages(np.random.default_rng(0).permutation(centres).astype(np.int32))
-        self._centre_rows = own_pages(self._rows[self._centres])
+        self._rows = mmap_copy(kept.astype(np.int32))
+        self._centres = mmap_copy(np.random.default_rng(0).permutation(centres).astype(np.int32))
+        self._centre_rows = mmap_copy(self._rows[self._centres])
         directions = rays_m[kept] / np.linalg.norm(rays_m[kept], axis=1, keepdims=True)
         self._tree = cKDTree(directions, balanced_tree=False)
         self._spacing_rad, self._keep_linear = spacing_rad, keep_linear
-        self._buffer = _Buffer(len(centres)) if rows is None else None
+        self._slots = mmap_copy(np.full(len(centres), _UNCUT, np.int32))
+        self._windows, self._count = Windows.empty(len(centres), mmap_zeros), 0
+        self._lock = Lock()
 
     def cut(
         self, in_view: Mask, clear: Mask, *, max_covered: float, max_windows: int, seed: int = 0
@@ -77,59 +77,34 @@ class WindowTable:
         chosen = np.flatnonzero(in_view[self._centre_rows])
         if seed:
             chosen = np.random.default_rng(seed).permutation(chosen)
-        windows, slots = self._take(chosen[:max_windows])
+        windows, slots = self._windows, self._slots_of(chosen[:max_windows])
         rows = windows.members.take(slots, axis=0)
         covered = (windows.front.take(slots, axis=0) & ~clear.take(rows)).mean(axis=1)
         return windows.select(slots[in_view.take(rows).all(axis=1) & (covered <= max_covered)])
 
-    def _take(self, chosen: Rows) -> tuple[Windows, Rows]:
-        """Windows, and the rows of the chosen centres that are useful."""
-        if self._buffer is not None:
-            return self._buffer.take(chosen, self._cut)
-        windows, useful = self._cut(chosen)
-        return windows, np.flatnonzero(useful)
-
-    def _cut(self, chosen: Rows) -> tuple[Windows, Mask]:
-        windows, reliability = cut_windows(
-            self._cloud, self._centres[chosen], (self._tree, self._rows),
-            spacing_rad=self._spacing_rad, keep_linear=self._keep_linear,
-        )  # fmt: skip
-        return windows, reliability > MIN_RELIABILITY
-
-    @property
-    def nbytes(self) -> int:
-        """Size in memory, without the cloud."""
-        kept = self._rows.nbytes + 2 * self._centres.nbytes + 2 * int(self._tree.data.nbytes)
-        return kept + (self._buffer.nbytes if self._buffer else 0)
-
-
-class _Buffer:
-    """Room for the windows of all centres; those of some are cut."""
-
-    def __init__(self, centres: int) -> None:
-        self._slots = mmap_copy(np.full(centres, _UNCUT, np.int32))
-        self._windows, self._count = Windows.empty(centres, mmap_zeros), 0
-        self._lock = Lock()
-
-    def take(
-        self, chosen: Rows, cut: Callable[[Rows], tuple[Windows, Mask]]
-    ) -> tuple[Windows, Rows]:
-        """The windows, and the rows of the chosen centres; missing windows are cut."""
+    def _slots_of(self, chosen: Rows) -> Rows:
+        """The rows of the windows of those chosen centres that are useful; missing ones are cut."""
         with self._lock:
             missing = chosen[self._slots[chosen] == _UNCUT]
             if len(missing):
-                windows, useful = cut(missing)
+                windows, reliability = cut_windows(
+                    self._cloud, self._centres[missing], (self._tree, self._rows),
+                    spacing_rad=self._spacing_rad, keep_linear=self._keep_linear,
+                )  # fmt: skip
+                useful = reliability > MIN_RELIABILITY
                 first, self._count = self._count, self._count + int(np.count_nonzero(useful))
                 self._windows.put(first, windows.select(useful))
                 self._slots[missing] = _USELESS
                 self._slots[missing[useful]] = np.arange(first, self._count)
             slots = self._slots[chosen].astype(np.intp)
-            return self._windows, slots[slots >= 0]
+            return slots[slots >= 0]
 
     @property
     def nbytes(self) -> int:
+        """Size in memory, without the cloud."""
         cut = self._count * self._windows.nbytes // max(1, len(self._slots))
-        return cut + self._slots.nbytes
+        kept = self._rows.nbytes + self._slots.nbytes + 2 * self._centres.nbytes
+        return cut + kept + 2 * int(self._tree.data.nbytes)
 
 
 class WindowTables:

@@ -31,7 +31,6 @@ Rows = NDArray[np.intp]
 WINDOW_POINTS = 25  # samples of a window; fewer cannot hold an edge and both its sides
 MIN_WINDOW_POINTS = 9
 WINDOW_STRETCH = 4.0  # longest window by the radius of an even one: room for single scan lines
-WINDOW_BYTES = WINDOW_POINTS * (3 * 4 + 4 + 1 + 4 * 4) + 4 * (len(FEATURES) + 2)  # in memory
 MIN_WEIGHT = 0.1  # of a window that counts where windows are weighed
 MIN_SPACING_RAD = np.radians(0.15)  # few sensors sample more finely along their scan lines
 
@@ -99,7 +98,7 @@ class Windows:
     @property
     def nbytes(self) -> int:
         """Size in memory."""
-        return len(self.counts) * WINDOW_BYTES
+        return sum(values.nbytes for values in vars(self).values())
 
 
 def cut_windows(
