@@ -1,7 +1,5 @@
 """Tables of results: printed as Markdown, for the notes, with their commit and command."""
 
-from __future__ import annotations
-
 import argparse
 import os
 import platform

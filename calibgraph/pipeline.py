@@ -33,11 +33,11 @@ from calibgraph.progress import Progress, Stopwatch, no_progress
 from calibgraph.rounds import AnyMatcher, Datasets, match_in_rounds, refine_with_camera_pairs
 from calibgraph.solver.joint import solve_joint
 from calibgraph.trust.assess import assess, assess_run, in_order
-from calibgraph.trust.evidence import Evidence, gather
+from calibgraph.trust.evidence import Evidence
 from calibgraph.trust.image_record import ImageRecord, RunChecks, to_metadata
 from calibgraph.trust.inputs import registered_twists
 from calibgraph.trust.lens_checks import asks_offset
-from calibgraph.trust.probability import TABLES, judge, model_of
+from calibgraph.trust.probability import STRUCTURE, TABLES, judge
 from calibgraph.trust.solution_checks import residuals_of, weaknesses
 from calibgraph.vehicle.rig import LidarResult, calibrate_rig_lidars
 
@@ -184,12 +184,8 @@ def solve(
     record = ImageRecord.from_metadata(solution.correspondences.metadata)
     watch = Stopwatch()
     with watch("checks"):
-        evidence = gather(
-            solution,
-            rig,
-            lambda _, groups: record.posteriors_of(solution.solved_rig.cameras, groups),
-            excluded=solution.config.excluded_cameras,
-        )
+        excluded, posteriors = solution.config.excluded_cameras, record.posteriors_of(solution)
+        evidence = Evidence(solution, rig, posteriors, excluded)
         checks = record.checks(evidence, assess(evidence))
     result = to_calibration(evidence, checks)
     motion = solution.correspondences
@@ -201,7 +197,8 @@ def solve(
 def to_calibration(evidence: Evidence, checks: RunChecks) -> Calibration:
     """A solution with its error bar, and its verdict by all checks."""
     solution, cameras = evidence.solution, evidence.cameras
-    model, tolerance = model_of(solution.correspondences.matcher), solution.config.tolerance
+    tolerance, matcher = solution.config.tolerance, solution.correspondences.matcher
+    model = STRUCTURE if matcher == STRUCTURE else TABLES
     models = dict.fromkeys(cameras, model) | dict.fromkeys(checks.unseen, TABLES)
     verdicts = {
         name: judge(each, evidence.probability_beyond(name), tolerance, models[name])

@@ -1,7 +1,5 @@
 """What `mkdocs build` adds to the pages: the API, formulas as MathML, pictures."""
 
-from __future__ import annotations
-
 import html
 import re
 from pathlib import Path

@@ -5,8 +5,6 @@
 writes them anew between the lines ``<!-- generated: NAME -->`` and ``<!-- end generated -->``.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections import Counter

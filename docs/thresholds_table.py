@@ -1,7 +1,5 @@
 """The table of thresholds in the documentation."""
 
-from __future__ import annotations
-
 from calibgraph.model.verdict import TOLERANCE, Threshold, in_unit, is_reachable
 from calibgraph.trust.thresholds import THRESHOLDS
 
@@ -34,12 +32,12 @@ def _line(rows: list[Threshold]) -> str:
 
 def _passes(rows: list[Threshold]) -> str:
     limits = ", ".join(in_unit(row.warn, row.unit, digits=4) for row in rows)
-    sign = "≤" if rows[0].direction == "at most" else "≥"
+    sign = "≤" if rows[0].warn <= rows[0].fail else "≥"
     return f"{sign} {limits}" + (" \\*" if rows[0].of_tolerance else "")
 
 
 def _fails(rows: list[Threshold]) -> str:
-    if not all(is_reachable(row.fail, row.unit, row.direction) for row in rows):
+    sign = ">" if rows[0].warn <= rows[0].fail else "<"
+    if not all(is_reachable(row.fail, row.unit, sign) for row in rows):
         return "never"
-    sign = ">" if rows[0].direction == "at most" else "<"
     return f"{sign} {', '.join(in_unit(row.fail, row.unit, digits=4) for row in rows)}"

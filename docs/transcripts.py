@@ -5,8 +5,6 @@
 writes the output of the program into the page.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import gc
@@ -10,7 +8,7 @@ import shutil
 import signal
 import sys
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,6 +22,7 @@ from calibgraph import (
     MatcherErrors,
     RelativePose,
     Rig,
+    evaluate,
     load_rig,
     simulate_correspondences,
 )
@@ -31,6 +30,8 @@ from calibgraph.cli import app as cli
 from calibgraph.cli import terminal
 from calibgraph.simulation.world import INSTALL_LIBRARIES
 from calibgraph.trust import assess, image_evidence, inputs
+from tests.chromium import chromium
+from tests.draws.cameras import camera_at
 
 Call = Callable[..., tuple[int, str, str]]
 
@@ -46,9 +47,6 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 ROOT = Path(__file__).parents[1]
 SAMPLE = ROOT / "data" / "sample"
-
-# Camera axes (right, down, forward) in LiDAR axes (forward, left, up).
-FORWARD = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 
 RADTAN5 = (-0.11, 0.05, 0.001, -0.002, 0.004)
 RADTAN8 = (0.3, -0.1, 0.0005, 0.001, 0.02, 0.35, -0.05, 0.01)
@@ -93,19 +91,8 @@ def make_camera(
     distortion: tuple[float, ...] = (),
 ) -> Camera:
     """A camera of KITTI's size at a position in the LiDAR frame, turned left by ``yaw_deg``."""
-    yaw = np.radians(yaw_deg)
-    turn = np.array([[np.cos(yaw), np.sin(yaw), 0], [-np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
-    T = np.eye(4)
-    T[:3, :3] = FORWARD @ turn
-    T[:3, 3] = -T[:3, :3] @ np.array(position_m)
-    return Camera(
-        model=model,
-        width_px=1240,
-        height_px=376,
-        intrinsics_px=Intrinsics(fx=718.0, fy=710.0, cx=607.0, cy=185.0),
-        distortion=distortion,
-        T_camera_lidar=T,
-    )
+    lens = Intrinsics(fx=718.0, fy=710.0, cx=607.0, cy=185.0)
+    return camera_at((1240, 376), lens, position_m, yaw_deg, model=model, distortion=distortion)
 
 
 def points_in_front(rng: np.random.Generator, count: int) -> np.ndarray:
@@ -124,6 +111,20 @@ def stereo_relative_pose(
     return RelativePose(
         a=a, b=b, T_a_b=T_a_b, rotation_sigma_rad=sigmas[0], translation_sigma_m=sigmas[1]
     )
+
+
+def require_poses(
+    found: Mapping[str, np.ndarray], expected: Mapping[str, np.ndarray], *, atol: float
+) -> None:
+    """Check (4, 4) transforms of all names that are expected."""
+    for name, T in expected.items():
+        np.testing.assert_allclose(found[name], T, rtol=0, atol=atol, err_msg=name)
+
+
+def require_near(found: Rig, truth: Rig, *, deg: float, cm: float) -> None:
+    """Check the error of every camera."""
+    for name, error in evaluate(found, truth).cameras.items():
+        assert error.rotation_error_deg < deg and error.translation_error_cm < cm, name
 
 
 @pytest.fixture
@@ -198,7 +199,7 @@ def calibrate_sample(folder: Path) -> CommandRun:
 @pytest.fixture
 def no_image_checks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Do not check results and guesses against the images, for tests of all else."""
-    monkeypatch.setattr(image_evidence, "check_images", lambda *_, **__: {})
+    monkeypatch.setattr(image_evidence, "measure_image_evidence", lambda *_, **__: {})
     for module in (assess, inputs):
         monkeypatch.setattr(module, "likely_intended_guess", lambda *_: None)
 
@@ -243,6 +244,13 @@ def open3d() -> Any:
     return pytest.importorskip(
         "open3d", reason=f"no libraries of Open3D: {INSTALL_LIBRARIES}", exc_type=ImportError
     )
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Any]:
+    """Chromium."""
+    with chromium() as browser:
+        yield browser
 
 
 @pytest.fixture(scope="session")

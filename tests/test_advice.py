@@ -1,7 +1,5 @@
 """What messages advise can be done as it is printed: commands exist, with their options."""
 
-from __future__ import annotations
-
 import ast
 import re
 import shlex

@@ -1,7 +1,5 @@
 """README and pages: links, commands, generated parts; their examples, and the tutorial, run."""
 
-from __future__ import annotations
-
 import re
 import shlex
 from collections.abc import Iterator
@@ -19,7 +17,7 @@ from calibgraph.matching.structure.schedule import LEVELS
 from calibgraph.simulation.world import INSTALL_LIBRARIES
 from docs.tables import API, PART, with_generated_parts
 from docs.transcripts import BLOCK, PAGE, run, shown
-from tests.conftest import ROOT, SAMPLE
+from tests.conftest import ROOT, SAMPLE, require_near, require_poses
 
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("[bd]*/README.md")])
 NOTES = sorted(ROOT.glob("benchmarks/notes/*.md"))
@@ -161,9 +159,8 @@ def result(folder: Path) -> calibgraph.Calibration:
 
 def test_the_sample_is_calibrated(result: calibgraph.Calibration, folder: Path) -> None:
     """With exact truth, to the resolution of a 640 px image."""
-    for name, error in calibgraph.evaluate(result.rig, TRUTH).cameras.items():
-        assert error.rotation_error_deg < 0.12, name  # 1 px is 0.12 deg
-        assert error.translation_error_cm < 3, name
+    # 1 px is 0.12 deg
+    require_near(result.rig, TRUTH, deg=0.12, cm=3)
     assert result.verdict.status == "PASS", result.verdict.reasons
     assert len(result.rounds) == len(LEVELS) - 3  # the search has done the first
     assert (folder / "out" / "python" / "calibration.yaml").is_file()
@@ -178,8 +175,7 @@ def test_arrays_give_the_numbers_of_the_folder(
     exec(compile(ARRAYS, "library.md", "exec"), names)
     same = names["result"]
     assert isinstance(same, calibgraph.Calibration)
-    for name, T in result.T_camera_lidar.items():
-        np.testing.assert_allclose(same.T_camera_lidar[name], T, atol=1e-9)
+    require_poses(same.T_camera_lidar, result.T_camera_lidar, atol=1e-9)
 
 
 @pytest.mark.usefixtures("no_image_checks")

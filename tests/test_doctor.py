@@ -1,7 +1,5 @@
 """What is wrong with a dataset is found before it is solved."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable
@@ -11,14 +9,18 @@ import cv2
 import numpy as np
 import pytest
 
-from calibgraph import Diagnosis, diagnose, load_rig
+from calibgraph import Diagnosis, Rig, diagnose, load_rig
 from tests.conftest import SAMPLE, Call
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A copy of the sample."""
-    return Path(shutil.copytree(SAMPLE, tmp_path / "sample"))
+    """A copy of two cameras of the sample."""
+    folder = Path(shutil.copytree(SAMPLE, tmp_path / "sample"))
+    shutil.rmtree(folder / "cameras" / "front_right")
+    cameras = load_rig(SAMPLE).cameras
+    Rig(cameras={n: cameras[n] for n in ("front_left", "left")}).save(folder / "rig.yaml")
+    return folder
 
 
 def texts(found: Diagnosis, level: str) -> list[str]:
@@ -119,7 +121,7 @@ def test_the_command_prints_it_and_exits_with_one_if_anything_is_to_be_fixed(
 ) -> None:
     code, out, err = call("doctor", folder)
     assert (code, out) == (0, "")
-    assert "note     6 frames, 3 cameras\n" in err
+    assert "note     6 frames, 2 cameras\n" in err
     (folder / "lidar/000003.npy").unlink()
     code, out, _ = call("doctor", folder, "--json")
     assert code == 1

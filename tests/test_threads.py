@@ -1,7 +1,5 @@
 """Threads of a program: several calls at a time, and other work beside them."""
 
-from __future__ import annotations
-
 import threading
 import time
 from concurrent.futures import Future, ThreadPoolExecutor

@@ -11,8 +11,6 @@ which may compile. ``compare`` prints a line per camera and case, and fails wher
 more than ``--sigmas`` of its own error bar or a verdict is another.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import resource

@@ -15,8 +15,6 @@ about values that are the same for all checks: one that has seen too little keep
 A kind of check that no case had makes a FAIL by itself from its limit of WARN on.
 """
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -190,7 +188,7 @@ def _most_probable(
         np.array([getattr(sample, name) for sample in samples])
         for name in ("off", "by_bar", "by_values")
     )
-    counts = np.where(off, SHARE_OFF / off.mean(), (1 - SHARE_OFF) / (1 - off.mean()))
+    counts = shares(samples)
     usual = np.concatenate([[INTERCEPT], np.tile(USUAL, len(kinds)), HOLDS])
     spreads = np.concatenate([[INTERCEPT_SPREAD], spread, HOLDS_SPREAD])
 

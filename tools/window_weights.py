@@ -11,8 +11,6 @@ the table shows the summed score at a recording's reference, in standard deviati
 all windows of one weight and with the network's.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -130,7 +128,7 @@ def train(samples: Sequence[Sample], seed: int) -> WindowNetwork:
     """The trained network."""
     torch.manual_seed(seed)
     torch.set_num_threads(1)
-    trainee = Trainee(untrained(np.concatenate([sample.features for sample in samples])))
+    trainee = Trainee(np.concatenate([sample.features for sample in samples]))
     sharpness = torch.nn.Parameter(torch.tensor(SHARPNESS))
     groups: list[dict[str, Any]] = [
         {"params": trainee.layers.parameters()},
@@ -156,16 +154,13 @@ def train(samples: Sequence[Sample], seed: int) -> WindowNetwork:
 
 
 class Trainee:
-    """The network that is trained, in torch; the features' units stay as they are."""
+    """The network that is trained, in torch, of random layers; for features (w, f) like these."""
 
-    def __init__(self, start: WindowNetwork) -> None:
-        self._mean, self._spread = torch.as_tensor(start.mean), torch.as_tensor(start.spread)
-        self._linear = []
-        for matrix, bias in start.layers:
-            layer = torch.nn.Linear(*matrix.shape)
-            layer.weight.data = torch.tensor(matrix.T, dtype=torch.float32)
-            layer.bias.data = torch.tensor(bias, dtype=torch.float32)
-            self._linear.append(layer)
+    def __init__(self, features: np.ndarray) -> None:
+        values = torch.as_tensor(features).double()
+        self._mean, self._spread = values.mean(0), values.std(0, correction=0) + 1e-6
+        sizes = pairwise((len(FEATURES), HIDDEN, HIDDEN, 1))
+        self._linear = [torch.nn.Linear(*size) for size in sizes]
         *hidden, last = self._linear
         gelus = [(layer, torch.nn.GELU(approximate="tanh")) for layer in hidden]
         self.layers = torch.nn.Sequential(*(module for pair in gelus for module in pair), last)
@@ -212,15 +207,6 @@ def score_each(image: np.ndarray, places: np.ndarray, windows: Windows, reach: i
     group, first = np.arange(count, dtype=np.int32), np.array([-reach, -reach])
     score_windows(pad(image), places, windows.counts, windows.basis, group, first, True, grids)
     return grids
-
-
-def untrained(features: np.ndarray) -> WindowNetwork:
-    """A network of random layers, for features (w, f) like these."""
-    sizes = pairwise((len(FEATURES), HIDDEN, HIDDEN, 1))
-    linear = [torch.nn.Linear(*size) for size in sizes]
-    layers = [(layer.weight.detach().T.numpy(), layer.bias.detach().numpy()) for layer in linear]
-    values = features.astype(np.float64)
-    return WindowNetwork(values.mean(axis=0), values.std(axis=0) + 1e-6, tuple(layers))
 
 
 def batches(samples: Sequence[Sample]) -> Iterator[tuple[Sample, torch.Tensor]]:

@@ -13,8 +13,6 @@ An axis is significant, as the audit itself decides it, where its deviation is b
 1000 right rigs shows; counted of cameras whose measurement the audit trusts.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path

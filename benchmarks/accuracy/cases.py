@@ -4,8 +4,6 @@ A kind is a function of what is good (a simulated world with its matcher, or a s
 a generator; it returns what is calibrated, the rig with its guess, and what was drawn.
 """
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Callable
 from dataclasses import replace
@@ -39,7 +37,7 @@ from calibgraph import (
     perturb,
     solve,
 )
-from calibgraph.model.geometry import invert, relative_transform
+from calibgraph.model.geometry import invert, relative_transform, transform
 from tools.scenes.spoilt_images import (
     as_image,
     blurred,
@@ -78,10 +76,13 @@ def derangement(count: int, rng: Rng) -> Array:
 
 def to_transform(angles_deg: Array, shift_m: Array) -> Array:
     """(4, 4) from a rotation vector [deg] and a shift [m]."""
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_rotvec(np.radians(angles_deg)).as_matrix()
-    T[:3, 3] = shift_m
-    return T
+    return transform(Rotation.from_rotvec(angles_deg, degrees=True), shift_m)
+
+
+def random_transform(rng: Rng, deg: float, m: float) -> Array:
+    """(4, 4) a motion of this size in random directions."""
+    axis, way = (v / np.linalg.norm(v) for v in rng.standard_normal((2, 3)))
+    return to_transform(deg * axis, m * way)
 
 
 def compose_extrinsics(rig: Rig, T_lidar_points: Array) -> Rig:
@@ -101,11 +102,7 @@ def with_stereo(rig: Rig, truth: Rig, a: str, b: str) -> Rig:
 
 def with_lenses(rig: Rig, change: Callable[[Camera], Drawn]) -> Rig:
     """The rig with some fields of every camera changed."""
-    fields = Camera.model_fields
-    cameras = {
-        name: Camera(**{**{field: getattr(camera, field) for field in fields}, **change(camera)})
-        for name, camera in rig.cameras.items()
-    }
+    cameras = {n: camera.model_copy(update=change(camera)) for n, camera in rig.cameras.items()}
     return rig.model_copy(update={"cameras": cameras})
 
 
@@ -276,9 +273,7 @@ def two_poses(world: World, rng: Rng, share: float) -> Case:
     deg, m = rng.uniform(1, 10), rng.uniform(0.1, 1.0)
     whole, seed = bool(rng.random() < 0.5), int(rng.integers(2**31))
     if whole:
-        axis, way = rng.standard_normal((2, 3))
-        step = to_transform(deg * axis / np.linalg.norm(axis), m * way / np.linalg.norm(way))
-        other = compose_extrinsics(world.truth, step)
+        other = compose_extrinsics(world.truth, random_transform(rng, deg, m))
     else:
         other = perturb(world.truth, rotation_deg=deg, translation_m=m, seed=seed)
     wrong = max(1, round(share * world.matches))
@@ -317,11 +312,8 @@ def time_offset(world: World, rng: Rng) -> Case:
 
 def lidar_axes(rig: Rig, rng: Rng) -> tuple[Rig, Drawn]:
     """The guess has cameras with the LiDAR's axes."""
-    transforms = {}
-    for name, T in rig.T_camera_lidar.items():
-        transforms[name] = np.eye(4)
-        transforms[name][:3, 3] = T[:3, :3].T @ T[:3, 3]
-    return rig.moved_to(transforms), {}
+    shifts = {name: T[:3, :3].T @ T[:3, 3] for name, T in rig.T_camera_lidar.items()}
+    return rig.moved_to({name: transform(np.eye(3), t) for name, t in shifts.items()}), {}
 
 
 TABLES: dict[str, Callable[[World, Rng], Case]] = {
@@ -362,8 +354,7 @@ def far(scene: Scene, rng: Rng, turned: bool) -> Case:
     drawn = {"guess_deg": deg, "guess_m": m}
     if not turned:
         return scene.data, scene.guess(deg, m), drawn
-    axis, way = (v / np.linalg.norm(v) for v in rng.standard_normal((2, 3)))
-    return scene.data, compose_extrinsics(scene.guess(), to_transform(deg * axis, m * way)), drawn
+    return scene.data, compose_extrinsics(scene.guess(), random_transform(rng, deg, m)), drawn
 
 
 def swapped(scene: Scene, rng: Rng, known: bool = False, distant: bool = False) -> Case:
@@ -452,9 +443,7 @@ def moved_halfway(scene: Scene, rng: Rng) -> Case:
     def turn(image: Array, index: int, camera: Camera, rng: Rng) -> Array:
         if index < half:
             return image
-        k = camera.intrinsics_px
-        K = np.array([[k.fx, 0, k.cx], [0, k.fy, k.cy], [0, 0, 1]])
-        warp = K @ step[:3, :3] @ np.linalg.inv(K)
+        warp = camera.matrix_px @ step[:3, :3] @ np.linalg.inv(camera.matrix_px)
         return cv2.warpPerspective(image, warp, image.shape[1::-1], borderMode=cv2.BORDER_REFLECT)
 
     return painted(scene, rng, turn)

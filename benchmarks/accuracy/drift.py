@@ -12,8 +12,6 @@ that whatever is significant is CHANGED. Three kinds of recordings:
 * common: with such an error, the same in all recordings, as of a lens.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -14,8 +14,6 @@ Errors of cameras are of their alignment, those of pairs of their mounts.
 NEES is the squared error in the metric of its covariance; its mean over 6 should be 1.
 """
 
-from __future__ import annotations
-
 from argparse import ArgumentParser
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -50,7 +48,7 @@ from calibgraph.model.geometry import relative_covariance, relative_transform, t
 from calibgraph.pipeline import to_calibration
 from calibgraph.solver.joint import solve_joint
 from calibgraph.trust.assess import assess
-from calibgraph.trust.evidence import gather
+from calibgraph.trust.evidence import Evidence
 from calibgraph.trust.image_record import RunChecks
 from tools.scenes.lens_errors import draw_lens_errors
 from tools.scenes.scan_errors import draw_scan_errors
@@ -197,7 +195,7 @@ def solve_streets(streets: Streets) -> Iterator[tuple[str, Record]]:
         streets.start, streets.table, Config(stage1="rig", learnt_weights=False),
         camera_matches=streets.matches,
     )  # fmt: skip
-    evidence = gather(solved, streets.start)
+    evidence = Evidence(solved, streets.start)
     checks = RunChecks(assess(evidence), unseen=evidence.cameras)
     verdicts = to_calibration(evidence, checks).camera_verdicts
     joint, mount = solved.covariance, solved.mount

@@ -6,8 +6,6 @@
 Each run has its own rig guess, scene, noise, time and direction of the event.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor

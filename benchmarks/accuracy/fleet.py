@@ -7,8 +7,6 @@ vehicles are poorly observed: their error bars are 10 times those of the others 
 1.5 mm per axis). 5 % of the cameras were moved, by 1 degree and 2 cm.
 """
 
-from __future__ import annotations
-
 import time
 from collections import Counter
 

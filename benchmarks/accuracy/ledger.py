@@ -3,8 +3,6 @@
 A line holds a hash of the code that made it (``code``). Lines of other code are kept and counted.
 """
 
-from __future__ import annotations
-
 import argparse
 import hashlib
 import json

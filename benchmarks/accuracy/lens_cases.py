@@ -11,8 +11,6 @@ calibrated with the right values, with the wrong ones, and with the wrong ones e
 All start 1 degree and 10 cm off. Cases are kept in ``--out``, a line each; a stopped run continues.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -151,14 +149,12 @@ def main() -> None:
     parser = ledger.case_parser(__doc__, "lens_cases")
     parser.add_argument("--sets", nargs="+", choices=SETS, default=[*SETS])
     parser.add_argument("--data", type=lambda text: text.split(","), default=[], help="only these")
-    parser.add_argument("--kind", help="only cases of this kind, as 'focal 0.03 fixed'")
     parser.add_argument("--scenes", type=Path, default=ROOT / "out" / "mixtures")
     parser.add_argument("--rigs", default="0:64", help="rendered ones")
     options = parser.parse_args()
     chosen = [
         case for case in cases(range(*map(int, options.rigs.split(":"))))
-        if case.level in options.sets and options.kind in (None, case.kind)
-        and (not options.data or case.data in options.data)
+        if case.level in options.sets and (not options.data or case.data in options.data)
     ]  # fmt: skip
     options.scenes.mkdir(parents=True, exist_ok=True)
     work = partial(run_case, folders=Folders(options.realdata, None), scenes=options.scenes)

@@ -1,7 +1,5 @@
 """Recorded and simulated data, and ways to change their images and clouds, for ``cases``."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 from pathlib import Path

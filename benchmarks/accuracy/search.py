@@ -10,8 +10,6 @@ that with this verdict. ``--cameras`` adds a row per camera, with its error bar 
 error over the variance of each axis (1 is expected).
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable
 from functools import partial

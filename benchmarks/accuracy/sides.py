@@ -13,8 +13,6 @@ Starts are 2 degrees and 10 cm off, or as ``--start`` says; rigs are six cameras
 beams, or four of 100 degrees. Errors are of the alignment of the cloud that stands.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from dataclasses import asdict, replace
@@ -39,9 +37,10 @@ from calibgraph import Intrinsics, Rig, load_rig, perturb
 from calibgraph.simulation.lidar import lidar_of, ring_gains, scan
 from calibgraph.simulation.recording import build_drive
 from calibgraph.simulation.rigs import rig_of
+from tests.draws.cameras import camera_at
 from tools.scenes.lens_errors import draw_lens_errors
 from tools.scenes.scan_errors import ScanErrors, draw_scan_errors
-from tools.scenes.sensor_streets import ALIGNMENT, aligned_rig, camera_at, render
+from tools.scenes.sensor_streets import ALIGNMENT, aligned_rig, render
 
 TURN_S, TURN_M = 0.1, 1.0  # of the LiDAR, at 10 m/s
 START_S = 1_700_000_000  # of stamps
@@ -92,7 +91,7 @@ def four_cameras() -> Rig:
     lens = Intrinsics(fx=268.5, fy=268.5, cx=319.5, cy=199.5)
     views = {"front": ((0.9, 0.0, -0.3), 0.0), "left": ((0.2, 0.8, -0.7), 90.0),
              "back": ((-0.8, 0.1, 0.1), 180.0), "right": ((0.1, -0.8, -0.6), -90.0)}  # fmt: skip
-    return Rig(cameras={name: camera_at(640, 400, lens, *view) for name, view in views.items()})
+    return Rig(cameras={name: camera_at((640, 400), lens, *view) for name, view in views.items()})
 
 
 RIGS = {"six": (six_cameras, 64), "sparse": (six_cameras, 32), "four": (four_cameras, 64)}

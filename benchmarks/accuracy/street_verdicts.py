@@ -9,8 +9,6 @@ six frames, rendered when it is needed. Groups 100 to 115 are to choose by, othe
 A result is right within 0.3 degrees and 7 cm of its alignment, and off beyond 0.5 degrees or 10 cm.
 """
 
-from __future__ import annotations
-
 import tempfile
 from collections import Counter
 from collections.abc import Iterable, Sequence

@@ -13,8 +13,6 @@ NEES is the squared error in the metric of its covariance; its mean over 6 shoul
 errors, 95 % should lie within the 95 % quantile of chi-squared with 6 degrees of freedom.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 
 import gtsam
@@ -32,7 +30,7 @@ from calibgraph.model.geometry import (
 )
 from calibgraph.solver.joint import solve_joint
 from calibgraph.solver.solution import Solution
-from calibgraph.trust.evidence import gather
+from calibgraph.trust.evidence import Evidence
 from tests.draws.places import draw_places, stereo
 
 Array = NDArray[np.float64]
@@ -93,7 +91,7 @@ def solved(matches: int, seed: int) -> tuple[list[Error], int]:
     rig = stereo()
     table = simulate_correspondences(rig, frames=FRAMES, matches=matches, errors=ERRORS, seed=seed)
     solution = solve_joint(rig, table, Config())
-    ours, T = gather(solution, rig).joint_covariance, solution.T_camera_lidar
+    ours, T = Evidence(solution, rig).joint_covariance, solution.T_camera_lidar
     return [
         *errors_of(T, rig, ours, "by frames (ours)"),
         *errors_of(T, rig, independent(solution), "(J^T J)^-1"),

@@ -12,8 +12,6 @@ With ``--moved`` a vehicle of three LiDARs is recorded twice at ten places of to
 0.03 degrees and 0.45 cm; in between nothing moves, or one LiDAR or the base by 0.2 degrees or 2 cm.
 """
 
-from __future__ import annotations
-
 import tempfile
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -26,7 +24,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from benchmarks.accuracy import ledger
+from benchmarks.accuracy.cases import random_transform
 from benchmarks.accuracy.ledger import Key, Record
+from benchmarks.accuracy.verdicts import class_of
 from benchmarks.tables import Table
 from calibgraph import CalibrationError, calibrate, check
 from calibgraph.model.geometry import invert, transform
@@ -40,9 +40,8 @@ PLACES = ("town", "street", "room", "corridor")
 SCATTER = np.repeat([np.radians(0.03), 0.0045], 3)
 """(6,) [rad, m] of the clouds of ``--moved``."""
 MOVES = ("nothing", "turned", "shifted", "base turned", "base shifted")
-_TURN, _SHIFT_M = np.radians(0.2), 0.02
+_TURN_DEG, _SHIFT_M = 0.2, 0.02
 _TOLERANCE = {"tolerance_deg": 0.1, "tolerance_cm": 1.0}
-_OFF_DEG, _OFF_CM = 0.5, 10.0
 
 
 def main() -> None:
@@ -78,7 +77,7 @@ def _drawn(case: Key, beams: int, rays: int) -> Record:
     scatter, guess = rng.uniform(0.0, 1.5) * PLACE_SIGMAS, {}
     for name, T in mounts.items():
         if name != "base" and rng.random() < 0.4:  # noqa: PLR2004
-            guess[name] = T @ _step(rng, np.radians(20.0), 0.5)
+            guess[name] = T @ random_transform(rng, 20.0, 0.5)
     clouds = _record(case.kind, mounts, scatter, int(rng.integers(3, 6)), rng, (beams, rays))
     with tempfile.TemporaryDirectory() as folder:
         try:
@@ -98,9 +97,8 @@ def _moved(case: Key, beams: int, rays: int) -> Record:
     """The sensors that ``check`` names, after one has moved or none."""
     rng, after = np.random.default_rng([6, case.seed]), dict(MOUNTS)
     lidar = "front" if case.seed % 2 else "left"
-    step = _step(
-        rng, _TURN * case.kind.endswith("turned"), _SHIFT_M * case.kind.endswith("shifted")
-    )
+    deg = _TURN_DEG * case.kind.endswith("turned")
+    step = random_transform(rng, deg, _SHIFT_M * case.kind.endswith("shifted"))
     if case.kind.startswith("base"):
         after = {name: T if name == "top" else invert(step) @ T for name, T in MOUNTS.items()}
         lidar = "top"
@@ -115,13 +113,6 @@ def _moved(case: Key, beams: int, rays: int) -> Record:
         )
         found = check(calibrate(first).rig, second, **_TOLERANCE)
     return {"named": [*found.wrong], "right": [] if case.kind == "nothing" else [lidar]}
-
-
-def _step(rng: np.random.Generator, turn: float, shift_m: float) -> Array:
-    """(4, 4) a motion of this size in a random direction."""
-    axes = rng.normal(size=(2, 3))
-    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
-    return transform(Rotation.from_rotvec(turn * axes[0]), shift_m * axes[1])
 
 
 def _record(
@@ -186,7 +177,7 @@ def report(records: Sequence[Record]) -> Table:
         of = counts.setdefault((record["kind"], record["data"]), Counter())
         of["refused"] += "refused" in record
         for one in record.get("lidars", {}).values():
-            is_off = one["error_deg"] > _OFF_DEG or one["error_cm"] > _OFF_CM
+            is_off = class_of(one) == "off"
             of[f"{one['status']}, {'off' if is_off else 'right'}"] += 1
         if "named" in record:
             of["as it is" if record["named"] == record["right"] else

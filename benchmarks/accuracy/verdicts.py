@@ -18,8 +18,6 @@ and E_t of that camera. Refusals (too few correspondences, say) have no error: t
 their own, never a PASS, and a false alarm if nothing was wrong.
 """
 
-from __future__ import annotations
-
 import argparse
 import re
 import tempfile

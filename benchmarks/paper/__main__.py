@@ -7,8 +7,6 @@ and its aggregates, the paper's solver with its settings, each camera alone, our
 known relative pose.
 """
 
-from __future__ import annotations
-
 from benchmarks.paper.draws import source_from
 from benchmarks.paper.experiment import run_experiment
 from benchmarks.paper.output import markdown

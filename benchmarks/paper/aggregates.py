@@ -1,7 +1,5 @@
 """The paper's other ways from the extrinsics of frames to one: their mean, and their mode."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

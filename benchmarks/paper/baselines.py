@@ -1,7 +1,5 @@
 """What our method is compared with: the solver that the paper publishes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from itertools import pairwise
 
@@ -13,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
-from calibgraph.model.geometry import invert, relative_transform
+from calibgraph.model.geometry import invert, relative_transform, transform
 from calibgraph.model.rig import Rig
 from calibgraph.solver.matches import CameraBlock, camera_blocks
 from calibgraph.solver.two_pass import Transforms
@@ -142,9 +140,5 @@ def _pack(T: Array) -> Array:
 
 def _unpack(names: list[str], x: Array) -> Transforms:
     """The (4, 4) of each camera from (6 N,) axis-angles and translations."""
-    T = {}
-    for name, six in zip(names, x.reshape(-1, _DIMENSIONS), strict=True):
-        T[name] = np.eye(4)
-        T[name][:3, :3] = Rotation.from_rotvec(six[:3]).as_matrix()
-        T[name][:3, 3] = six[3:]
-    return T
+    each = zip(names, x.reshape(-1, _DIMENSIONS), strict=True)
+    return {name: transform(Rotation.from_rotvec(six[:3]), six[3:]) for name, six in each}

@@ -22,7 +22,7 @@ from calibgraph.io.rigs import REFERENCE_FILE, load_rig
 from calibgraph.matching.structure import StructureMatcher
 from calibgraph.model.config import Config, PresetName, Terms, preset
 from calibgraph.model.correspondences import Correspondences
-from calibgraph.model.geometry import relative_transform
+from calibgraph.model.geometry import relative_transform, transform
 from calibgraph.model.metrics import perturb
 from calibgraph.model.rig import RelativePose, Rig
 from calibgraph.progress import no_progress
@@ -213,10 +213,8 @@ class Draw:
         rng, pairs = np.random.default_rng([self.seed, 1]), []
         T = self.reference.T_camera_lidar
         for a, b in pairwise(T):
-            noise = np.eye(4)
-            rotation = RELATIVE_SIGMA_RAD * rng.standard_normal(3)
-            noise[:3, :3] = Rotation.from_rotvec(rotation).as_matrix()
-            noise[:3, 3] = RELATIVE_SIGMA_M * rng.standard_normal(3)
+            rotation = Rotation.from_rotvec(RELATIVE_SIGMA_RAD * rng.standard_normal(3))
+            noise = transform(rotation, RELATIVE_SIGMA_M * rng.standard_normal(3))
             pairs.append(RelativePose(
                 a=a, b=b, T_a_b=noise @ relative_transform(T[a], T[b]),
                 rotation_sigma_rad=RELATIVE_SIGMA_RAD, translation_sigma_m=RELATIVE_SIGMA_M,

@@ -1,7 +1,5 @@
 """The paper's experiment over many draws: each method's errors as medians with 90 % intervals."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor

@@ -1,7 +1,5 @@
 """The experiment's report in Markdown, beside the numbers that the paper publishes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 

@@ -1,7 +1,5 @@
 """Named scenarios of correspondences: a rig, and the errors of its matcher."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from calibgraph.model.correspondences import Correspondences

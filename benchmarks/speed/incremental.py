@@ -5,8 +5,6 @@
 2 cameras, 500 correspondences each, 10 % outliers, all in one run.
 """
 
-from __future__ import annotations
-
 import gc
 import os
 import time
@@ -23,7 +21,7 @@ from calibgraph.tracking import warm_up_tracker
 from tests.draws.drives import simulate_drive
 from tools.scenes.drives import camera
 
-RIG = Rig(cameras={"left": camera((0.3, 0.1, -0.1), 0), "right": camera((0.3, -0.4, -0.1), 0)})
+RIG = Rig(cameras={"left": camera((0.3, 0.1, -0.1)), "right": camera((0.3, -0.4, -0.1))})
 GUESS = perturb(RIG, rotation_deg=1.0, translation_m=0.1, seed=0)
 ERRORS = MatcherErrors(noise_px=1.0, frame_noise_px=0.5, outlier_share=0.1)
 POOL = 400

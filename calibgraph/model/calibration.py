@@ -22,8 +22,8 @@ from calibgraph.model import geometry, result_files
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences
-from calibgraph.model.error_sources import ErrorSources, left_out
-from calibgraph.model.lens import LensEstimate, describe_unstated, joint_parameters
+from calibgraph.model.error_sources import ErrorSources
+from calibgraph.model.lens import LensEstimate, joint_parameters
 from calibgraph.model.places import Groups
 from calibgraph.model.rig import Rig
 from calibgraph.model.summary import Summary, summarize
@@ -256,24 +256,31 @@ class Calibration:
     @property
     def unstated_lenses(self) -> str:
         """The cameras whose lenses count as calibrated, in a clause; empty if none does."""
-        is_estimated = bool({*self.config.estimate} - {"offset", "readout"})
-        return "" if is_estimated else describe_unstated(self.rig)
+        names = [name for name, c in self.rig.cameras.items() if c.intrinsics_sigma_px is None]
+        if not names or {*self.config.estimate} - {"offset", "readout"}:
+            return ""
+        stated = "counts as calibrated (the rig states no intrinsics_sigma_px)"
+        return f"lens of {', '.join(names)}: {stated}"
 
     @property
     def not_included(self) -> str:
-        """The errors that the bars leave out: relative poses show the clouds' scale."""
-        table, cameras = self.correspondences, self.rig.cameras.values()
+        """The errors that the bars leave out: relative poses show the clouds' scale.
+
+        By what was estimated, whether the LiDAR's motion is known, and when points were taken.
+        Without either, clouds count as corrected for it.
+        """
+        table, cameras, estimated = self.correspondences, self.rig.cameras, {*self.config.estimate}
         if table is None:  # of a tracker, which corrects for the motion what the rig states
-            moves = any(camera.time_offset_s or camera.readout_s for camera in cameras)
+            moves = any(camera.time_offset_s or camera.readout_s for camera in cameras.values())
         else:
             moves = table.twist_per_s is not None
-        return left_out(
-            self.config,
-            self.rig,
-            has_new_lens=bool(self.lens),
-            motion_known=moves,
-            points_timed=table is not None and table.late_s is not None,
-        )
+        timed = moves or (table is not None and table.late_s is not None)
+        free = self.lens and estimated - {"offset", "readout"}
+        lens = "other intrinsics" if free else "intrinsics"
+        others = [] if moves or "offset" in estimated else ["time offset"]
+        others += [] if timed else ["motion during a scan"]
+        others += [] if self.rig.relative_poses else ["range scale"]
+        return ", ".join([f"{lens} beyond what the rig states", *others])
 
     def error_bar_holds(self, name: str) -> bool:
         """Whether the covariance of a camera or pair "A->B" describes its error.

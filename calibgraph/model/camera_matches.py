@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import copy
 import json
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, fields
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.errors import CorrespondenceError
-from calibgraph.model.correspondences import MAX_COORDINATE, write_table
+from calibgraph.model.correspondences import MAX_COORDINATE, Table
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -28,7 +26,7 @@ COLUMNS = (*NAMES, "frame", *NUMBERS, *PLANES)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class CameraMatches:
+class CameraMatches(Table):
     """Features that two cameras see at one instant, as columns of equal length.
 
     Sides: 0 is camera A, 1 is camera B. A plane q, with q . p = 1 for its points p in the LiDAR
@@ -54,16 +52,12 @@ class CameraMatches:
     planes_lidar_per_m: Array
     metadata: dict[str, Any] = field(default_factory=dict)
 
+    _SHAPES: ClassVar[Mapping[str, tuple[int, ...]]] = {
+        "camera_index": (2,), "frame": (), "pixels_px": (2, 2), "planes_lidar_per_m": (2, 3),
+    }  # fmt: skip
+
     def __post_init__(self) -> None:
-        n = len(self.frame)
-        for name, shape in _SHAPES.items():
-            view = getattr(self, name).view()
-            if view.shape != (n, *shape):
-                raise CorrespondenceError(
-                    f"{name} has shape {view.shape}, expected {(n, *shape)} like the column frame"
-                )
-            view.flags.writeable = False
-            object.__setattr__(self, name, view)
+        self._check_shapes()
         self._check_values()
 
     @staticmethod
@@ -77,9 +71,6 @@ class CameraMatches:
             planes_lidar_per_m=np.empty((0, 2, 3)),
             metadata=metadata or {},
         )
-
-    def __len__(self) -> int:
-        return len(self.frame)
 
     def __repr__(self) -> str:
         counts = ", ".join(f"{a}-{b}: {len(self.of_pair(a, b))}" for a, b in self.pairs())
@@ -99,17 +90,6 @@ class CameraMatches:
             return np.empty(0, np.intp)
         wanted = [self.cameras.index(a), self.cameras.index(b)]
         return np.flatnonzero((self.camera_index == wanted).all(axis=1))
-
-    def select(self, rows: NDArray[Any] | slice) -> CameraMatches:
-        """The table with only some rows: a mask, an index array or a slice."""
-        kept = copy.copy(self)  # not checked again: rows of a valid table are valid
-        for name in _SHAPES:
-            object.__setattr__(kept, name, getattr(self, name)[rows])
-        return kept
-
-    def save(self, path: Path | str) -> None:
-        """Write the table as Parquet, or as CSV if the name ends in .csv, atomically."""
-        write_table(self.to_arrow(), Path(path))
 
     def to_arrow(self) -> pa.Table:
         """The table in the file format's columns, its metadata in the schema."""
@@ -145,13 +125,6 @@ class CameraMatches:
             raise CorrespondenceError(f"{what} must {rule}, found {found[row].tolist()}", row=row)
 
 
-_SHAPES: dict[str, tuple[int, ...]] = {
-    "camera_index": (2,), "frame": (), "pixels_px": (2, 2),
-    "planes_lidar_per_m": (2, 3),
-}  # fmt: skip
-assert set(_SHAPES) == {f.name for f in fields(CameraMatches)} - {"cameras", "metadata"}
-
-
 def concatenate_camera_matches(tables: Iterable[CameraMatches]) -> CameraMatches:
     """Concatenate tables of the same cameras; the first gives the metadata.
 
@@ -161,5 +134,5 @@ def concatenate_camera_matches(tables: Iterable[CameraMatches]) -> CameraMatches
     given = list(tables)
     if len({table.cameras for table in given}) != 1:
         raise ValueError("expected tables of the same cameras")
-    columns = {name: np.concatenate([getattr(t, name) for t in given]) for name in _SHAPES}
+    columns = {name: np.concatenate([getattr(t, name) for t in given]) for name in given[0]._SHAPES}
     return CameraMatches(cameras=given[0].cameras, metadata=given[0].metadata, **columns)

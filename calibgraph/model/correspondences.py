@@ -5,10 +5,10 @@ from __future__ import annotations
 import copy
 import json
 import logging
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field, fields
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -49,8 +49,50 @@ _log = logging.getLogger(__name__)
 MAX_COORDINATE = 1e6  # px or m: far beyond any image and any LiDAR's range
 
 
+class Table:
+    """Columns of equal length: what tables of points and of features have in common."""
+
+    _SHAPES: ClassVar[Mapping[str, tuple[int, ...]]]  # by column, of one row
+    frame: NDArray[np.int64]
+
+    def _check_shapes(self) -> None:
+        for name, of_row in self._SHAPES.items():
+            column, shape = getattr(self, name), (len(self), *of_row)
+            if column is not None and column.shape != shape:
+                raise CorrespondenceError(
+                    f"{name} has shape {column.shape}, expected {shape} like the column frame"
+                )
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    def select(self, rows: NDArray[Any] | slice) -> Self:
+        """The table with only some rows: a mask, an index array or a slice."""
+        kept = object.__new__(type(self))  # not checked again: rows of a valid table are valid
+        vars(kept).update(vars(self))
+        if not isinstance(rows, slice) and rows.dtype == np.bool_:
+            rows = np.flatnonzero(rows)
+        for name in self._SHAPES:
+            column = getattr(self, name)
+            if column is not None:
+                some = column[rows] if isinstance(rows, slice) else column.take(rows, axis=0)
+                vars(kept)[name] = some
+        return kept
+
+    def save(self, path: Path | str) -> None:
+        """Write the table as Parquet, or as CSV if the name ends in .csv, atomically.
+
+        CSV has no place for the metadata: a warning is logged.
+        """
+        write_table(self.to_arrow(), Path(path))
+
+    def to_arrow(self) -> pa.Table:
+        """The table in the file format's columns, its metadata in the schema."""
+        raise NotImplementedError
+
+
 @dataclass(frozen=True, eq=False, repr=False)
-class Correspondences:
+class Correspondences(Table):
     """2D-3D correspondences of several cameras and frames, as columns of equal length.
 
     Attributes:
@@ -90,15 +132,13 @@ class Correspondences:
     findings: MatcherFindings = field(init=False)
     places: Places = field(init=False)
 
+    _SHAPES: ClassVar[Mapping[str, tuple[int, ...]]] = {
+        "camera_index": (), "frame": (), "pixels_px": (2,), "points_lidar_m": (3,),
+        "confidence": (), "information_px": (3,), "stamp_ns": (), "twist_per_s": (6,), "late_s": (),
+    }  # fmt: skip
+
     def __post_init__(self) -> None:
-        n = len(self.frame)
-        for column, width in _WIDTHS.items():
-            array = getattr(self, column)
-            shape = (n,) if width == 1 else (n, width)
-            if array is not None and array.shape != shape:
-                raise CorrespondenceError(
-                    f"{column} has shape {array.shape}, expected {shape} like the column frame"
-                )
+        self._check_shapes()
         if len(self.camera_index) and not (
             0 <= self.camera_index.min() <= self.camera_index.max() < len(self.cameras)
         ):
@@ -152,25 +192,9 @@ class Correspondences:
             metadata=metadata or {},
         )
 
-    def __len__(self) -> int:
-        return len(self.frame)
-
     def __repr__(self) -> str:
         counts = ", ".join(f"{name}: {count}" for name, count in self.counts().items())
         return f"Correspondences({counts}; {len(np.unique(self.frame))} frames)"
-
-    def select(self, rows: NDArray[Any] | slice) -> Correspondences:
-        """The table with only some rows: a mask, an index array or a slice."""
-        kept = object.__new__(type(self))  # not checked again: rows of a valid table are valid
-        vars(kept).update(vars(self))
-        if not isinstance(rows, slice) and rows.dtype == np.bool_:
-            rows = np.flatnonzero(rows)
-        for name in _WIDTHS:
-            column = getattr(self, name)
-            if column is not None:
-                some = column[rows] if isinstance(rows, slice) else column.take(rows, axis=0)
-                vars(kept)[name] = some
-        return kept
 
     def of_camera(self, name: str) -> Correspondences:
         """The table of one camera alone (without rows, if it is not in this table)."""
@@ -223,13 +247,6 @@ class Correspondences:
         counts = np.bincount(self.camera_index, minlength=len(self.cameras))
         return dict(zip(self.cameras, counts.tolist(), strict=True))
 
-    def save(self, path: Path | str) -> None:
-        """Write the table as Parquet, or as CSV if the name ends in .csv, atomically.
-
-        CSV has no place for the metadata: a warning is logged.
-        """
-        write_table(self.to_arrow(), Path(path))
-
     def to_arrow(self) -> pa.Table:
         """The table in the file format's columns, its metadata in the schema."""
         import pyarrow as pa
@@ -277,14 +294,6 @@ class Correspondences:
             raise error(text, camera=camera, frame=frame, row=row)
 
 
-_WIDTHS = {
-    "camera_index": 1, "frame": 1, "pixels_px": 2, "points_lidar_m": 3, "confidence": 1,
-    "information_px": 3, "stamp_ns": 1, "twist_per_s": 6, "late_s": 1,
-}  # fmt: skip
-_OTHERS = {"cameras", "metadata", "findings", "places"}
-assert set(_WIDTHS) == {f.name for f in fields(Correspondences)} - _OTHERS
-
-
 def _optional(values: ArrayLike | None, dtype: type) -> Any:
     return None if values is None else np.asarray(values, dtype=dtype)
 
@@ -316,7 +325,9 @@ def concatenate(tables: Sequence[Correspondences]) -> Correspondences:
             columns[name] = np.concatenate(given)
     known = [table.metadata for table in tables if len(table) or table.metadata] or [{}]
     joined = tables[0].with_metadata(joined_metadata(known))
-    vars(joined).update({**dict.fromkeys(_WIDTHS), **columns, "cameras": names})  # as checked
+    vars(joined).update(
+        {**dict.fromkeys(tables[0]._SHAPES), **columns, "cameras": names}
+    )  # as checked
     return joined
 
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from calibgraph.model.config import Config
-from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import in_unit
 
 MATCHES = "scatter of the matches"
@@ -125,19 +123,3 @@ class ErrorSources:
         rotation = self.rotation_deg, tolerance[0], "deg", self.rotation
         translation = self.translation_cm, tolerance[1], "cm", self.translation
         return max(rotation, translation, key=lambda bar: bar[0] / bar[1])
-
-
-def left_out(
-    config: Config, rig: Rig, *, has_new_lens: bool, motion_known: bool, points_timed: bool
-) -> str:
-    """The errors that the bars leave out: relative poses show the clouds' scale.
-
-    By what was estimated, whether the LiDAR's motion is known, and when points were taken. Without
-    either, clouds count as corrected for it.
-    """
-    free = has_new_lens and {*config.estimate} - {"offset", "readout"}
-    lens = "other intrinsics" if free else "intrinsics"
-    others = [] if motion_known or "offset" in config.estimate else ["time offset"]
-    others += [] if motion_known or points_timed else ["motion during a scan"]
-    others += [] if rig.relative_poses else ["range scale"]
-    return ", ".join([f"{lens} beyond what the rig states", *others])

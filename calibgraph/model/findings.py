@@ -104,8 +104,9 @@ class MatcherFindings:
         for key in values.keys() & {*_PER_CAMERA}:
             of = values[key] or {}
             values[key] = {str(name): of[name] for name in of} if isinstance(of, dict) else of
-        if not _COMMON & values.keys():
-            values = _prior_of(metadata.get("matcher")) | values
+        matcher = metadata.get("matcher")
+        if not _COMMON & values.keys() and isinstance(matcher, str) and matcher != UNKNOWN:
+            values = error_components().matchers.get(matcher, {}) | values
         try:
             return _READER.validate_python(values) if values else MatcherFindings()
         except ValidationError as error:
@@ -114,14 +115,12 @@ class MatcherFindings:
 
     def to_metadata(self) -> dict[str, Any]:
         """As keys of the metadata; findings without a value have no key."""
-        content: dict[str, Any] = {}
-        for item in fields(self):
-            value = getattr(self, item.name)
-            if item.name in _PER_CAMERA:
-                content |= {item.name: dict(value)} if value else {}
-            elif value is not None and value != item.default:
-                content[item.name] = value
-        return content
+        stated = ((item, getattr(self, item.name)) for item in fields(self))
+        return {
+            item.name: dict(value) if item.name in _PER_CAMERA else value
+            for item, value in stated
+            if value not in (None, {}, item.default)
+        }
 
     @property
     def systematic_sigmas(self) -> tuple[float, float]:
@@ -197,13 +196,6 @@ def _size(value: Any) -> float:
         return math.inf
 
 
-def _prior_of(matcher: object) -> dict[str, float]:
-    """The error sizes of a known matcher; empty for others, whose tables have to state them."""
-    known = error_components().matchers
-    named = isinstance(matcher, str) and matcher in known and matcher != UNKNOWN
-    return known[str(matcher)] if named else {}
-
-
 UNKNOWN = "unknown"
 """Stands for the matcher of a table that states nothing."""
 
@@ -251,12 +243,10 @@ def error_components() -> ErrorComponents:
     """
     text = (files("calibgraph.model") / "error_components.json").read_text(encoding="utf-8")
     content = json.loads(text)
-    frames = _sizes(content["frames"])
     return ErrorComponents(
         matchers={name: _sizes(one) for name, one in content["matchers"].items()},
-        **{f"pair_{name}": size for name, size in _sizes(content["pairs"]).items()},
-        frame_correlation=frames.pop("correlation"),
-        **frames,
+        **_sizes(content["pairs"]),
+        **_sizes(content["frames"]),
         **_sizes(content["sizes"]),
     )
 

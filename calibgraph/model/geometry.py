@@ -29,21 +29,16 @@ def transform(rotation: Rotation | ArrayLike, translation: ArrayLike = (0.0, 0.0
 
 def invert(T_a_b: Array) -> Array:
     """(4, 4) T_b_a, or (f, 4, 4) of as many."""
-    return np.asarray(np.linalg.inv(T_a_b), dtype=np.float64)
+    inverse = np.zeros(T_a_b.shape)
+    inverse[..., :3, :3] = T_a_b[..., :3, :3].swapaxes(-1, -2)
+    inverse[..., :3, 3:] = -inverse[..., :3, :3] @ T_a_b[..., :3, 3:]
+    inverse[..., 3, 3] = 1.0
+    return inverse
 
 
 def move_points(points_b: Array, T_a_b: Array) -> Array:
     """(n, 3) points in the frame a, of points in b."""
     return np.asarray(points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3])
-
-
-def invert_each(T_a_b: Array) -> Array:
-    """(f, 4, 4) T_b_a of as many rigid transforms: faster than :func:`invert`."""
-    inverse = np.zeros_like(T_a_b)
-    inverse[..., :3, :3] = T_a_b[..., :3, :3].swapaxes(-1, -2)
-    inverse[..., :3, 3:] = -inverse[..., :3, :3] @ T_a_b[..., :3, 3:]
-    inverse[..., 3, 3] = 1.0
-    return inverse
 
 
 def relative_transform(T_a_c: Array, T_b_c: Array) -> Array:

@@ -207,16 +207,6 @@ def state_calibrated(rig: Rig) -> Rig:
     return rig.model_copy(update={"cameras": cameras})
 
 
-def describe_unstated(rig: Rig) -> str:
-    """The cameras whose lens has no stated sigma, in a clause; empty without any."""
-    names = [name for name, camera in rig.cameras.items() if camera.intrinsics_sigma_px is None]
-    if not names:
-        return ""
-    return (
-        f"lens of {', '.join(names)}: counts as calibrated (the rig states no intrinsics_sigma_px)"
-    )
-
-
 def has_other_lens(camera: Camera, other: Camera) -> bool:
     """Whether two lenses differ, or the sizes of their images."""
     one, two = (

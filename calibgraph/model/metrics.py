@@ -106,31 +106,22 @@ def evaluate(
     }
     if covariance is None:
         covariance = {name: camera.covariance for name, camera in estimate.cameras.items()}
+    both = [(name, new, reference.cameras[name]) for name, new in estimate.cameras.items()]
     deviations = {
-        name: deviation(found[name], reference.cameras[name], covariance.get(name))
-        for name in found
-        if reference.cameras[name].covariance is not None
+        name: deviation(new.T_camera_lidar, old, covariance.get(name))
+        for name, new, old in both
+        if old.covariance is not None
     }
-    clocks = (_later_ms(estimate, reference, key) for key in ("time_offset_s", "readout_s"))
-    return Evaluation(cameras, pairs, deviations, _lens_px(estimate, reference), *clocks)
+    lens_px = {n: corner_distance_px(old, new) for n, new, old in both if has_other_lens(old, new)}
+    offsets = {name: (new.time_offset_s, old.time_offset_s) for name, new, old in both}
+    readouts = {name: (new.readout_s, old.readout_s) for name, new, old in both}
+    return Evaluation(cameras, pairs, deviations, lens_px, _later_ms(offsets), _later_ms(readouts))
 
 
-def _lens_px(estimate: Rig, reference: Rig) -> dict[str, float]:
-    """Largest distance of the corners' rays, of cameras whose lenses differ."""
-    both = {n: (reference.cameras[n], camera) for n, camera in estimate.cameras.items()}
-    return {
-        name: corner_distance_px(before, after)
-        for name, (before, after) in both.items()
-        if has_other_lens(before, after)
-    }
-
-
-def _later_ms(estimate: Rig, reference: Rig, key: str) -> dict[str, float]:
-    """Difference of a time, of the cameras of which both rigs state it."""
-    both = {
-        n: [getattr(rig.cameras[n], key) for rig in (estimate, reference)] for n in estimate.cameras
-    }
-    return {n: 1e3 * (one - other) for n, (one, other) in both.items() if None not in (one, other)}
+def _later_ms(times_s: Mapping[str, tuple[float | None, float | None]]) -> dict[str, float]:
+    """Difference of two times, of the cameras of which both are stated."""
+    both = times_s.items()
+    return {n: 1e3 * (new - old) for n, (new, old) in both if new is not None and old is not None}
 
 
 def deviation(estimate: Array, reference: Camera, covariance: Array | None) -> Deviation:

@@ -67,11 +67,15 @@ class Places:
             frame = np.where(np.isin(frame, stop), np.int64(stop[0]), frame)
         return frame
 
-    def split(self, frame: Numbers) -> list[Numbers]:
-        """(f,) numbers of frames, place by place."""
+    def _numbers_of(self, frame: Numbers) -> Numbers:
+        """(f,) which place each frame is of."""
         groups = self.places or ()
         place_of = {number: place for place, group in enumerate(groups) for number in group}
-        place = np.array([place_of.get(number, len(groups)) for number in frame.tolist()], np.int64)
+        return np.array([place_of.get(number, len(groups)) for number in frame.tolist()], np.int64)
+
+    def split(self, frame: Numbers) -> list[Numbers]:
+        """(f,) numbers of frames, place by place."""
+        place = self._numbers_of(frame)
         order = np.argsort(place, kind="stable")
         edges = np.flatnonzero(np.diff(place[order])) + 1
         return [part for part in np.split(frame[order], edges) if len(part)]
@@ -83,8 +87,8 @@ class Places:
 
     def frames_per_place(self, frame: Numbers) -> float:
         """Number of (f,) frames that share the error of a place, averaged over frames."""
-        counts = [len(place) for place in self.split(frame)]
-        return float(np.square(counts).sum() / max(1, len(frame)))
+        counts = np.bincount(self._numbers_of(frame))
+        return float(counts @ counts / max(1, len(frame)))
 
     def name_of(self, number: int) -> str:
         """The place of a frame: the first number of its group; empty if no group has it."""

@@ -185,14 +185,8 @@ def _checked_model(name: Any) -> Any:
 CameraName = Annotated[str, AfterValidator(_checked_name)]
 FrameId = Annotated[str, Field(pattern=r"^\S{1,200}$"), AfterValidator(_require_printable)]
 Sigma = Annotated[float, Field(ge=1e-5, allow_inf_nan=False)]  # below, LM stalls
-KnownSigma = (
-    Annotated[float, Field(ge=1e-5)]
-    | tuple[
-        Annotated[float, Field(ge=1e-5)],
-        Annotated[float, Field(ge=1e-5)],
-        Annotated[float, Field(ge=1e-5)],
-    ]
-)
+_OrInfinite = Annotated[float, Field(ge=1e-5)]
+KnownSigma = _OrInfinite | tuple[_OrInfinite, _OrInfinite, _OrInfinite]
 Size = Annotated[int, Field(gt=0, le=1_000_000, strict=True)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Bounded = Annotated[float, Field(ge=-MAX_COORDINATE, le=MAX_COORDINATE, allow_inf_nan=False)]
@@ -356,12 +350,8 @@ class Vehicle(_Model):
     @property
     def sigmas(self) -> Array:
         """(6,) of rotation [rad] and translation [m], in the vehicle's axes."""
-        return np.hstack(
-            [
-                np.broadcast_to(self.rotation_sigma_rad, 3),
-                np.broadcast_to(self.translation_sigma_m, 3),
-            ]
-        )
+        parts = self.rotation_sigma_rad, self.translation_sigma_m
+        return np.concatenate([np.broadcast_to(part, 3) for part in parts])
 
     @property
     def unknown_axes(self) -> tuple[str, ...]:

@@ -79,9 +79,7 @@ class Check:
         """Whether the status is the one that the limits give the value."""
         if self.value is None or self.warn is None or self.fail is None:
             return False
-        sign = 1.0 if self.warn <= self.fail else -1.0
-        value, warn, fail = sign * self.value, sign * self.warn, sign * self.fail
-        return self.status == grade(not value <= warn, not value <= fail)
+        return self.status == grade(self.value, self.warn, self.fail)
 
     @property
     def severity(self) -> float:
@@ -142,8 +140,9 @@ class ErrorProbability:
     @property
     def status(self) -> Status:
         """PASS, WARN or FAIL; a wide error bar alone is a FAIL only if an error is sure."""
-        sure = self.probability > _SURE
-        return grade(not self.probability < PASS_BELOW, sure or not self.by_checks <= FAIL_ABOVE)
+        if self.probability > _SURE or not self.by_checks <= FAIL_ABOVE:
+            return "FAIL"
+        return "PASS" if self.probability < PASS_BELOW else "WARN"
 
     @property
     def percent(self) -> str:
@@ -276,12 +275,12 @@ def rig_verdict(cameras: Mapping[str, Verdict], *, named: bool = True) -> Verdic
     return Verdict(checks, worst, tuple(cameras.values()))
 
 
-def grade(warn: bool, fail: bool) -> Status:
-    """FAIL, else WARN, else PASS."""
-    return "FAIL" if fail else "WARN" if warn else "PASS"
+def grade(value: float, warn: float, fail: float) -> Status:
+    """PASS, WARN or FAIL by the limits of a value, whose order gives the side; NaN fails."""
+    if warn > fail:
+        value, warn, fail = -value, -warn, -fail
+    return "PASS" if value <= warn else "WARN" if value <= fail else "FAIL"
 
-
-Direction = Literal["at most", "at least"]
 
 _CELL = 7  # characters of a number, of which eight and a name fit on 80 columns
 _LARGEST = {"share": 1.0, "deg": 180.0}  # that a value can be
@@ -294,8 +293,8 @@ class Threshold:
     Attributes:
         key: by which checks look the row up.
         name: of the measured number and its check.
-        direction: "at most" or "at least": on which side of the limits PASS lies.
-        warn: the last value that is PASS.
+        warn: the last value that is PASS; smaller ones are, too, if it is below the next limit,
+            else larger ones.
         fail: the last value that is not FAIL.
         unit: of the values; "share" is printed in percent.
         question: what the check answers, in words.
@@ -305,7 +304,6 @@ class Threshold:
 
     key: str
     name: str
-    direction: Direction
     warn: float
     fail: float
     unit: str
@@ -321,46 +319,41 @@ class Threshold:
         """
         if not self.of_tolerance:
             return self
-        ratio = ratio_of(self.unit, tolerance)
+        unit = ("deg", "cm").index(self.unit)
+        ratio = tolerance[unit] / TOLERANCE[unit]
         return replace(self, warn=self.warn * ratio, fail=self.fail * max(ratio, 1.0))
 
     def grade(self, value: float) -> Status:
         """PASS, WARN or FAIL of a value; NaN fails."""
-        if self.direction == "at most":
-            return grade(not value <= self.warn, not value <= self.fail)
-        return grade(not value >= self.warn, not value >= self.fail)
+        return grade(value, self.warn, self.fail)
 
-    def check(self, value: float, *, name: str = "", advice: str = "") -> Check:
-        """The check of a value."""
-        status, name, meaning = self.grade(value), name or self.name, advice or self.advice
-        limit = self.fail if status == "FAIL" else self.warn
-        text = f"{name}: {beside(value, limit, self.unit)}"
-        if status != "PASS":
-            side = "above" if self.direction == "at most" else "below"
-            text += f", {side} the limit {in_unit(limit, self.unit)}"
-            text += f": {meaning}" if meaning else ""
-        return self.describe(float(value), status, text, name=name)
+    def check(
+        self,
+        value: float,
+        text: str = "",
+        *,
+        name: str = "",
+        advice: str = "",
+        status: Status | None = None,
+    ) -> Check:
+        """The check of a value; if it is not PASS, the advice follows its sentence.
 
-    def check_in_words(self, value: float, text: str, *, name: str = "") -> Check:
-        """The check of a value with its own sentence; if it is not PASS, the advice follows."""
-        status = self.grade(value)
-        advice = f": {self.advice}" if self.advice and status != "PASS" else ""
-        return self.describe(value, status, text + advice, name=name)
-
-    def describe(self, value: float, status: Status, text: str, *, name: str = "") -> Check:
-        """A check whose sentence, and perhaps status, depend on more than the value."""
-        limits = (self.warn, self.fail, self.unit)
-        return Check(name or self.name, status, text, value, *limits, kind=self.key)
-
-
-def ratio_of(unit: str, tolerance: tuple[float, float]) -> float:
-    """A tolerance [deg, cm] over the default one: that of the rotation or of the distance."""
-    return tolerance[("deg", "cm").index(unit)] / TOLERANCE[("deg", "cm").index(unit)]
+        ``text`` is its own sentence, in place of one of value and limit.
+        """
+        status, name, advice = status or self.grade(value), name or self.name, advice or self.advice
+        if not text:
+            limit = self.fail if status == "FAIL" else self.warn
+            text = f"{name}: {beside(value, limit, self.unit)}"
+            if status != "PASS":
+                side = "above" if self.warn <= self.fail else "below"
+                text += f", {side} the limit {in_unit(limit, self.unit)}"
+        text += f": {advice}" if advice and status != "PASS" else ""
+        return Check(name, status, text, float(value), self.warn, self.fail, self.unit, self.key)
 
 
-def is_reachable(limit: float, unit: str, direction: Direction) -> bool:
-    """Whether a value can lie beyond a limit: no count is negative, a share of a score may be."""
-    if direction == "at most":
+def is_reachable(limit: float, unit: str, sign: str) -> bool:
+    """Whether a value can be > or < a limit: no count is negative, a share of a score may be."""
+    if sign == ">":
         return limit < _LARGEST.get(unit, math.inf)
     return limit > 0 or unit == "share"
 

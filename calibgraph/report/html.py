@@ -26,7 +26,7 @@ from calibgraph.model.result_files import (
     TABLES,
     require_own_tables,
 )
-from calibgraph.model.verdict import Check, Direction, beside, in_unit, is_reachable
+from calibgraph.model.verdict import Check, beside, in_unit, is_reachable
 from calibgraph.report.kit import page_template
 from calibgraph.report.lidar_views import draw_lidars
 from calibgraph.report.page_overlays import (
@@ -190,11 +190,9 @@ def check_cells(check: Check) -> tuple[str, str, str]:
         return "", "", ""
     if check.warn is None or check.fail is None or not check.is_graded:
         return in_unit(check.value, check.unit), "", ""
-    side: Direction = "at least" if check.warn > check.fail else "at most"
+    sign = "<" if check.warn > check.fail else ">"
     warn, fail = (  # empty if no value can be bad
-        f"{'>' if side == 'at most' else '<'} {in_unit(limit, check.unit)}"
-        if is_reachable(limit, check.unit, side)
-        else ""
+        f"{sign} {in_unit(limit, check.unit)}" if is_reachable(limit, check.unit, sign) else ""
         for limit in (check.warn, check.fail)
     )
     found = beside(check.value, check.fail if check.status == "FAIL" else check.warn, check.unit)

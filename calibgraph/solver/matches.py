@@ -127,7 +127,7 @@ class CameraBlock:
         """
         medians = median_norm(self.information)
         if self.information is None:
-            norms = self.block.run_norms(T_camera_lidar, runs, factor=1.0 / float(medians))
+            norms = self.block.run_norms(T_camera_lidar, runs) / medians
             return norms[0], norms[-1]
         sizes_px = self._constrained.run_norms(T_camera_lidar, runs)[-1] / medians
         return sizes_px, self.block.run_norms(T_camera_lidar, runs)[-1] / medians

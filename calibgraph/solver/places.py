@@ -41,7 +41,7 @@ from calibgraph.graph.variables import (
 )
 from calibgraph.model.geometry import (
     adjoints,
-    invert_each,
+    invert,
     retract_all,
     to_T_lidar_camera,
 )
@@ -171,7 +171,7 @@ class Linearization:
     @cached_property
     def _T_camera_cloud(self) -> Array:
         """(M, P, 4, 4) of the data."""
-        return self.inverses[1:] @ invert_each(self.inverses[0])
+        return self.inverses[1:] @ invert(self.inverses[0])
 
     @cached_property
     def data(self) -> BlockSums:
@@ -196,7 +196,7 @@ class Linearization:
             shown = _poses(self.shared, pair.keys)
             seen = self.inverses[0, pair.places] @ shown[:, None]
             sums = pair.block.run_sums(seen[0], seen[1], pair.edges)
-            by_cloud = -adjoints(invert_each(seen.reshape(-1, 4, 4))).reshape(2, -1, 6, 6)
+            by_cloud = -adjoints(invert(seen.reshape(-1, 4, 4))).reshape(2, -1, 6, 6)
             by = np.tile(np.eye(12, 18, 6), (len(pair.places), 1, 1))
             by[:, :6, :6], by[:, 6:, :6] = by_cloud
             hessian, gradient = _turned(by) @ sums.hessian @ by, _times(_turned(by), sums.gradient)

@@ -11,7 +11,7 @@ import numpy as np
 
 from calibgraph.arrays import Array
 from calibgraph.model.calibration import Calibration
-from calibgraph.model.geometry import invert_each, pair_covariances, pose_rows
+from calibgraph.model.geometry import invert, pair_covariances, pose_rows
 from calibgraph.model.summary import summarize
 from calibgraph.model.verdict import START, Check, Verdict
 from calibgraph.report.as_json import finite
@@ -19,7 +19,6 @@ from calibgraph.tracking.estimate import Estimate
 from calibgraph.tracking.events import Event
 from calibgraph.tracking.frames import StreamFrame
 from calibgraph.tracking.state import COUNTS, State
-from calibgraph.trust.evidence import Estimate as Checked
 from calibgraph.trust.solution_checks import check_estimate
 from calibgraph.trust.thresholds import threshold
 from factors.pose_kernel import logarithms
@@ -71,17 +70,15 @@ def _verdict(of: Verdicts, camera: int) -> Verdict:
     name, rows, absent = of.names[camera], pose_rows(camera), int(of.absent[camera])
     own = of.covariance[rows, rows]
     is_free = bool(np.isnan(own).any())
-    found = Checked(
-        has_matches=True,
+    checks = check_estimate(
         used=counts["used"],
         frames=int(of.frames[camera]),
         covariance=None if is_free else own,
         is_free=is_free,
-        conflicts=tuple(one for one in of.conflicts if name in (one.pair.a, one.pair.b)),
+        conflicts=[one for one in of.conflicts if name in (one.pair.a, one.pair.b)],
         scatter_only=not of.findings.states_common_error,
         tolerance=of.config.tolerance,
     )
-    checks = [*check_estimate(found)]
     if repeated >= limit > absent - repeated:
         checks.append(stuck)
     elif absent >= limit:
@@ -117,7 +114,7 @@ def _counts(state: State, camera: int) -> dict[str, int]:
 def second_moments(estimate: Estimate) -> Array:
     """(6 n, 6 n) of the mounts about the estimates."""
     mounts, covariance = estimate.window.reported("mount")
-    away = logarithms(estimate.T_camera_lidar @ invert_each(mounts)).ravel()
+    away = logarithms(estimate.T_camera_lidar @ invert(mounts)).ravel()
     return covariance + np.outer(away, away)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from calibgraph.arrays import Array
 from calibgraph.model.geometry import (
-    invert_each,
+    invert,
     retract_all,
     to_T_lidar_camera,
 )
@@ -70,7 +70,7 @@ def _newest(state: State, graph: EpochGraph) -> Array:
     for _ in range(_GATE_STEPS if cameras else 0):
         poses = map(to_T_lidar_camera, at)
         found = [block.sums(T) for block, T in zip(blocks.values(), poses, strict=True)]
-        steps = logarithms(start @ invert_each(at))[..., None]
+        steps = logarithms(start @ invert(at))[..., None]
         pull = np.array([sums.gradient for sums in found]) + older.gradient
         pull += (older.hessian @ steps)[..., 0]
         whole = np.array([sums.hessian for sums in found]) + older.hessian + WEAK
@@ -84,7 +84,7 @@ def _newest(state: State, graph: EpochGraph) -> Array:
 
 def _set_references(state: State, references: Array) -> None:
     """Take all sums about other references."""
-    steps = logarithms(state.references @ invert_each(references))
+    steps = logarithms(state.references @ invert(references))
     state.references = references
     state.sums = state.sums.shift_reference(
         np.broadcast_to(steps, (len(state.numbers), *steps.shape))

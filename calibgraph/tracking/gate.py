@@ -10,7 +10,7 @@ import numpy as np
 from calibgraph.arrays import Array, Mask
 from calibgraph.graph.objective import projection_graph
 from calibgraph.model.config import Config
-from calibgraph.model.geometry import invert_each
+from calibgraph.model.geometry import invert
 from calibgraph.solver.matches import MIN_MATCHES, CameraBlock
 from calibgraph.solver.pnp import frame_pose
 from calibgraph.solver.robust import ResidualScale
@@ -110,7 +110,7 @@ def sums_of(state: State, gated: Mapping[int, Gated]) -> Sums:
     hessian = root @ state.curvature[cameras] @ root.swapaxes(1, 2)
     gradient = here.gradient
     if not np.array_equal(poses, to[cameras]):
-        steps = logarithms(poses @ invert_each(to[cameras]))
+        steps = logarithms(poses @ invert(to[cameras]))
         gradient = gradient + (hessian @ steps[..., None])[..., 0]
     return Sums.of(
         hessian=hessian,

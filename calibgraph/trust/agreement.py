@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping
 from itertools import combinations
-from typing import NamedTuple
 
 import numpy as np
 
@@ -35,18 +34,8 @@ BLAME_SIGMAS = 1.0
 one with its own, to be taken for the one that is wrong."""
 
 
-class PairAgreement(NamedTuple):
-    """The relative pose of cameras a and b from images against the calibration.
-
-    Degrees and centimetres are between the two T_b_a; sigmas the largest difference along an axis
-    of b, in standard deviations.
-    """
-
-    a: str
-    b: str
-    degrees: float
-    centimetres: float
-    sigmas: float
+Apart = tuple[float, float, float]
+"""Degrees and centimetres between two T_b_a; the largest difference along an axis in sigmas."""
 
 
 def pair_agreement_checks(evidence: Evidence) -> dict[str, list[Check]]:
@@ -55,37 +44,38 @@ def pair_agreement_checks(evidence: Evidence) -> dict[str, list[Check]]:
     if solution.camera_matches is None or solution.alone is None or alone.mount is None:
         return {}
     rig, covariance = solution.rig.moved_to(alone.mount.T_camera_lidar), alone.mount.covariance
-    found = [
-        pair_agreement(rig, fit, covariance)
+    apart = {
+        (fit.a, fit.b): pair_agreement(rig, fit, covariance)
         for fit in alone.pair_fits
         if evidence.fitted_blocks.keys() >= {fit.a, fit.b}
-    ]
+    }
     return {
-        name: [check_agreement(one, name, found) for one in found if name in (one.a, one.b)]
+        name: [check_agreement(pair, name, apart) for pair in apart if name in pair]
         for name in evidence.cameras
     }
 
 
-def check_agreement(found: PairAgreement, camera: str, all_found: Sequence[PairAgreement]) -> Check:
+def check_agreement(
+    pair: tuple[str, str], camera: str, apart: Mapping[tuple[str, str], Apart]
+) -> Check:
     """The check of one camera of a pair, which other pairs may show to be the other's fault."""
-    row, name = threshold("pair_agreement"), f"relative pose of {found.a} and {found.b} by images"
-    status, other = row.grade(found.sigmas), found.b if camera == found.a else found.a
+    row, (degrees, centimetres, sigmas) = threshold("pair_agreement"), apart[pair]
+    (other,), name = {*pair} - {camera}, f"relative pose of {pair[0]} and {pair[1]} by images"
     text = (
-        f"images and correspondences contradict each other on the pose of {found.a} to {found.b} "
-        f"by {found.degrees:.2g} deg, {found.centimetres:.2g} cm, {found.sigmas:.3g} sigma"
+        f"images and correspondences contradict each other on the pose of {pair[0]} to {pair[1]} "
+        f"by {degrees:.2g} deg, {centimetres:.2g} cm, {sigmas:.3g} sigma"
     )
     own, of_other = (  # by which each disagrees with the cameras outside the pair
-        max((o.sigmas for o in all_found if o is not found and one in (o.a, o.b)), default=0.0)
+        max((of[2] for names, of in apart.items() if names != pair and one in names), default=0.0)
         for one in (camera, other)
     )
-    if status == "PASS" or not of_other > max(row.warn, own + BLAME_SIGMAS):
-        text += "" if status == "PASS" else f": {row.advice}"
-        return row.describe(found.sigmas, status, text, name=name)
-    text += f": by its other pairs ({of_other:.3g} sigma) it is {other} that is wrong"
-    return row.describe(own, "WARN", text, name=name)
+    if row.grade(sigmas) == "PASS" or not of_other > max(row.warn, own + BLAME_SIGMAS):
+        return row.check(sigmas, text, name=name)
+    advice = f"by its other pairs ({of_other:.3g} sigma) it is {other} that is wrong"
+    return row.check(own, text, name=name, advice=advice, status="WARN")
 
 
-def pair_agreement(rig: Rig, fit: PairFit, covariance: Array) -> PairAgreement:
+def pair_agreement(rig: Rig, fit: PairFit, covariance: Array) -> Apart:
     """A pair by its images, A held near the calibration, against one that has not used them.
 
     Args:
@@ -98,7 +88,7 @@ def pair_agreement(rig: Rig, fit: PairFit, covariance: Array) -> PairAgreement:
     own = relative_covariance(covariance, first, second, T_b_a)
     sigmas = np.sqrt(np.diag(own) + np.diag(fit.covariance))
     largest = float(np.max(np.abs(twist_between(fit.T_b_a, T_b_a)) / sigmas))
-    return PairAgreement(fit.a, fit.b, *pose_difference(fit.T_b_a, T_b_a), largest)
+    return *pose_difference(fit.T_b_a, T_b_a), largest
 
 
 def one_pose_checks(evidence: Evidence) -> dict[str, list[Check]]:
@@ -152,7 +142,7 @@ def check_competing_solution(solution: Solution, camera: str) -> Check:
         iterations = _ransac_iterations(row.warn * int(ours.sum()), len(left_out))
         T = frame_pose(seen_by, left_out, solution.config, iterations=iterations)
     if T is None:
-        return row.describe(0.0, "PASS", f"{row.name}: none")
+        return row.check(0.0, f"{row.name}: none")
     theirs = block.within_gate(T, gate_px)
     degrees, centimetres = pose_difference(T, solution.T_camera_lidar[camera])
     apart = zip((degrees, centimetres), tolerance, TOLERANCE, strict=True)
@@ -184,9 +174,7 @@ def place_checks(evidence: Evidence) -> Checks:
     frames = errors.model.frames
     for name in errors.model.blocks:
         kept, given = (
-            np.bincount(
-                place_of(b.frame_numbers, errors.model.frames), b.frame_counts, len(of_place)
-            )
+            np.bincount(place_of(b.frame_numbers, frames), b.frame_counts, len(of_place))
             for b in (evidence.solution.inliers.blocks[name], evidence.fitted_blocks[name])
         )
         seen = np.flatnonzero(given)
@@ -206,5 +194,5 @@ def place_checks(evidence: Evidence) -> Checks:
             which = f"frame {first}" if first == last else f"frames {first} to {last}"
             number = f"{value:.2g} {row.unit}".rstrip()
             text = f"{row.name}: {number} at place {place + 1} ({which})"
-            checks[name].append(row.check_in_words(value, text))
+            checks[name].append(row.check(value, text))
     return checks

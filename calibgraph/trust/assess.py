@@ -59,8 +59,7 @@ RUN_CHECKS: tuple[Callable[[MatchingRun], Checks], ...] = (
 
 def assess(evidence: Evidence) -> dict[str, list[Check]]:
     """Per camera, the checks of a solution."""
-    checks = concatenate([check(evidence) for check in SOLUTION_CHECKS], evidence.cameras)
-    return {name: advise_together(each) for name, each in checks.items()}
+    return concatenate([check(evidence) for check in SOLUTION_CHECKS], evidence.cameras)
 
 
 def assess_run(run: MatchingRun, evidence: Evidence) -> RunChecks:
@@ -90,7 +89,8 @@ def _brightness_checks(run: MatchingRun, checks: Checks) -> Checks:
         camera = run.guess.cameras[name]
         grays = [frame.load_gray(name, camera).mean() for frame in data.frames if wrong]
         if wrong and (text := describe_brightness(name, grays)):
-            found[name] = [_cause(BRIGHTNESS, text, wrong)]
+            decisive = any(check.decisive for check in wrong)  # the cause of one is one
+            found[name] = [Check(BRIGHTNESS, "FAIL" if decisive else "WARN", text)]
     return found
 
 
@@ -103,8 +103,3 @@ def _intended_guess_checks(run: MatchingRun, checks: Checks) -> Checks:
     error = likely_intended_guess(run.dataset, run.guess) if failed else None
     found = [] if error is None else [Check("convention of the guess", "FAIL", error)]
     return dict.fromkeys(failed, found)
-
-
-def _cause(name: str, text: str, explained: Sequence[Check]) -> Check:
-    """A cause of other checks: a FAIL, which is decisive, only if one of these is."""
-    return Check(name, "FAIL" if any(check.decisive for check in explained) else "WARN", text)

@@ -29,7 +29,7 @@ from calibgraph.matching.structure.pose_refinement import (
 from calibgraph.model.geometry import T_OPTICAL_LINK, angle_deg, invert, transform
 from calibgraph.model.rig import Rig
 from calibgraph.parallel import core_pool
-from calibgraph.trust.thresholds import limit
+from calibgraph.trust.thresholds import CONVENTION_DEG, CONVENTION_GAIN, CONVENTION_M
 
 _FRAMES = 3  # that a corrected guess is matched in
 _CAMERAS = 3  # of a rig, that they are tried for
@@ -144,10 +144,10 @@ def convention_error_between(
     Of errors that lead about as near, the first of the list, the most common one.
     """
     distances: dict[str, float] = {}
-    most_deg, most_m = limit("convention_rotation"), limit("convention_translation")
+    most_deg, most_m = CONVENTION_DEG, CONVENTION_M
     undone = {name: undo_convention_errors(guesses[name]) for name in results}
     for error in undo_convention_errors(np.eye(4)):
-        apart = [_difference(undone[name][error], T) for name, T in results.items()]
+        apart = [difference(undone[name][error], T) for name, T in results.items()]
         if all(degrees < most_deg and metres < most_m for degrees, metres in apart):
             shares = (degrees / most_deg + metres / most_m for degrees, metres in apart)
             distances[error] = sum(shares) / len(apart)
@@ -223,7 +223,7 @@ class _Trial:
     def _is_better(self, name: str, found: Candidate, given: Candidate) -> bool:
         """Whether a pose agrees better than the guess, which no search from there would reach."""
         guess, T = self.guess.T_camera_lidar[name], found.body[name].T_camera_lidar
-        degrees, metres = _difference(guess, T)
+        degrees, metres = difference(guess, T)
         in_reach = degrees < math.sqrt(3) * SEARCH_DEG and metres < math.sqrt(3) * SEARCH_M
         return _gains(found, given) and not in_reach
 
@@ -236,9 +236,7 @@ class _Trial:
         """The best pose within some degrees and a metre; z-score 0 if few points are in view."""
         camera = self.guess.cameras[name].moved_to(T_camera_lidar)
         points = self.frames[name].clouds[0].points_lidar_m
-        pixels, valid = camera.lens.project(
-            points @ T_camera_lidar[:3, :3].T + T_camera_lidar[:3, 3]
-        )
+        pixels, valid = camera.lens.project(points, T_camera_lidar)
         if np.sum(valid & camera.in_image(pixels)) < _LEAST_POINTS:
             return Candidate({name: camera}, 0.0)
         return approach(self.frames, {name: camera})
@@ -256,7 +254,7 @@ def _sentence(error: str, cameras: Sequence[str]) -> str:
 
 
 def _gains(found: Candidate, given: Candidate) -> bool:
-    return found.z_score >= limit("convention_gain") * given.z_score
+    return found.z_score >= CONVENTION_GAIN * given.z_score
 
 
 def _is_accepted(candidate: Candidate) -> bool:
@@ -271,7 +269,7 @@ def _corrected(guess: Mapping[str, Array]) -> list[dict[str, Array]]:
     for error in next(iter(by_camera.values()), ()):
         corrected = {name: each[error] for name, each in by_camera.items()}
         apart = (
-            [_difference(T, other[name]) for name, T in corrected.items()]
+            [difference(T, other[name]) for name, T in corrected.items()]
             for other in (guess, *kept)
         )
         if not any(all(deg < _NEAR_DEG and m < _NEAR_M for deg, m in each) for each in apart):
@@ -279,6 +277,6 @@ def _corrected(guess: Mapping[str, Array]) -> list[dict[str, Array]]:
     return kept
 
 
-def _difference(one: Array, two: Array) -> tuple[float, float]:
+def difference(one: Array, two: Array) -> tuple[float, float]:
     """Between two T_camera_lidar: angle [deg], difference of the translations [m]."""
     return angle_deg(one[:3, :3] @ two[:3, :3].T), float(np.linalg.norm(one[:3, 3] - two[:3, 3]))

@@ -7,18 +7,14 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from calibgraph.arrays import Array
-from calibgraph.model.geometry import (
-    angle_deg,
-    invert,
-    pose_difference,
-    transform,
-)
+from calibgraph.model.geometry import invert, pose_difference, transform
 from calibgraph.model.verdict import Check
-from calibgraph.trust.conventions import convention_error_between, in_words
+from calibgraph.trust.conventions import convention_error_between, difference, in_words
 from calibgraph.trust.evidence import Checks, Evidence
-from calibgraph.trust.thresholds import limit, threshold
+from calibgraph.trust.thresholds import GUESS_TURNED_DEG, SWAP_SLACK, threshold
 
 
 def guess_checks(evidence: Evidence) -> Checks:
@@ -33,20 +29,14 @@ def guess_checks(evidence: Evidence) -> Checks:
         for reach in (findings.range_rotation_deg, findings.range_translation_m)
     )
     row, guesses = replace(row, warn=max(row.warn, range_m)), evidence.guess.T_camera_lidar
-    results = evidence.solution.T_camera_lidar
-    found = {name: T for name, T in results.items() if name not in findings.missed}
-    frame = describe_other_frame(guesses, found)
-    for name, result in results.items():
-        guess = guesses[name]
-        degrees = angle_deg(guess[:3, :3] @ result[:3, :3].T)
-        metres = float(np.linalg.norm(guess[:3, 3] - result[:3, 3]))
-        is_turned = degrees > max(limit("guess_rotation"), range_deg)
-        is_far = is_turned or row.grade(metres) != "PASS"
-        error = convention_error_between({"": guess}, {"": result}) if is_far else None
+    frame = describe_other_frame(guesses, evidence.found)
+    for name, result in evidence.solution.T_camera_lidar.items():
+        degrees, metres = difference(guesses[name], result)
+        is_far = degrees > max(GUESS_TURNED_DEG, range_deg) or row.grade(metres) != "PASS"
+        error = convention_error_between({"": guesses[name]}, {"": result}) if is_far else None
         words = "" if error is None else f"it seems that {in_words(error)}"
-        advice = "; or ".join(filter(None, (words, frame)))
-        check = row.check(metres, advice=advice)
-        if error is not None and check.status == "PASS":
+        check = row.check(metres, advice="; or ".join(filter(None, (words, frame))))
+        if words and check.status == "PASS":
             text = f"{check.text} and {degrees:.3g} deg: {words}"
             check = replace(check, status="WARN", text=text)
         checks[name] = [check]
@@ -55,9 +45,7 @@ def guess_checks(evidence: Evidence) -> Checks:
 
 def swap_checks(evidence: Evidence) -> Checks:
     """Whether a camera ended where another one's guess is; of those that have been found."""
-    missed, T = evidence.findings.missed, evidence.solution.T_camera_lidar
-    found = {name: result for name, result in T.items() if name not in missed}
-    return compare_with_other_guesses(evidence.guess.T_camera_lidar, found)
+    return compare_with_other_guesses(evidence.guess.T_camera_lidar, evidence.found)
 
 
 def compare_with_other_guesses(
@@ -75,9 +63,12 @@ def compare_with_other_guesses(
     if len(names) == 1 or not results:
         return checks
     squared = np.full((len(names), len(names)), np.nan)  # from a guess to a result, if there is one
-    squared[:, [name in results for name in names]] = _squared_distances(
-        guesses, {name: results[name] for name in names if name in results}
-    )
+    found = [name in results for name in names]
+    ended = np.array([results[name] for name in names if name in results])
+    away = ended @ invert(np.array([*guesses.values()]))[:, None]
+    shifts, turns = away[..., :3, 3], away[..., :3, :3].reshape(-1, 3, 3)
+    angles = Rotation.from_matrix(turns).magnitude().reshape(away.shape[:2])
+    squared[:, found] = angles**2 + (shifts**2).sum(axis=-1) + SWAP_SLACK**2
     own = np.diag(squared)
     ratios = np.sqrt((squared + squared.T) / (own + own[:, None]))
     ratios = np.where(np.isnan(own)[:, None], (squared / own) ** 0.25, ratios)
@@ -88,17 +79,6 @@ def compare_with_other_guesses(
         what = f"distance of this camera and {other} to each other's guess over that to their own"
         checks[name] = [row.check(float(of.min()), name=what)]
     return checks
-
-
-def _squared_distances(guesses: Mapping[str, Array], results: Mapping[str, Array]) -> Array:
-    """(g, r) between T_camera_lidar: centres [m] and angle [rad], and a result's usual error."""
-    one, two = np.array([*guesses.values()])[:, None], np.array([*results.values()])
-    R = one[..., :3, :3] @ two[:, :3, :3].swapaxes(1, 2)
-    axes = R[..., [2, 0, 1], [1, 2, 0]] - R[..., [1, 2, 0], [2, 0, 1]]
-    angles = np.arctan2(np.linalg.norm(axes, axis=-1), np.trace(R, axis1=-2, axis2=-1) - 1.0)
-    centers = [T[..., :3, :3].swapaxes(-1, -2) @ T[..., :3, 3:] for T in (one, two)]
-    apart = centers[0] - centers[1]
-    return np.asarray(angles**2 + (apart**2).sum(axis=(-1, -2)) + limit("swap_slack") ** 2)
 
 
 def point_distance_checks(evidence: Evidence) -> Checks:

@@ -35,7 +35,6 @@ from calibgraph.matching.structure.shift_scores import (
     crop_grids,
 )
 from calibgraph.model.clock import clock_of
-from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.places import NOWHERE, Places
 from calibgraph.model.rig import Camera, Rig
@@ -43,6 +42,7 @@ from calibgraph.model.verdict import TOLERANCE, Check
 from calibgraph.parallel import Threads, core_pool
 from calibgraph.progress import Progress, no_progress
 from calibgraph.solver.columns import ColumnFit, apply_twist, block_of, fit_columns
+from calibgraph.solver.lens import MATCH_SHARE
 from calibgraph.trust.evidence import Checks, grade_by_images
 from calibgraph.trust.lens_parameter import (
     IMAGES,
@@ -53,7 +53,7 @@ from calibgraph.trust.lens_parameter import (
     lens_variable,
 )
 from calibgraph.trust.pose_posterior import FrameScorer, Images
-from calibgraph.trust.thresholds import limit, threshold
+from calibgraph.trust.thresholds import LENS_FRAMES_BEST, LENS_Z_SCORE, threshold
 from factors import Columns, displace, fields_px
 from factors.columns import DISTORTION
 
@@ -247,7 +247,7 @@ def _fit_at_peaks(
         block,
         camera.T_camera_lidar,
         Columns(camera.lens, names, sigmas),
-        shared_variance=max(of_place, limit("lens_match_share") * len(block)),
+        shared_variance=max(of_place, MATCH_SHARE * len(block)),
         considered=len(DISTORTION),
     )
 
@@ -258,53 +258,29 @@ def image_checks(run: MatchingRun) -> Checks:
     They are scored as by the matcher ``structure``, which does not use all that other matchers use:
     the result of a matcher that does not fail on images gets warnings only. Of a solution with
     camera pairs, the one without them is checked: next to a camera with a wrong lens, a right one
-    is moved, and at the wrong one's place the lens cannot be measured.
+    is moved, and at the wrong one's place the lens cannot be measured. Cameras that a search did
+    not find have no pose to check. Not observable: a principal point wrong along the shorter side
+    of the image (it is equivalent to a rotation).
     """
-    if run.out_of_time:
+    table, config = run.correspondences, run.solution.config
+    solved = run.solution.without_pairs().solved_rig.cameras
+    cameras = {name: of for name, of in solved.items() if name not in table.findings.missed}
+    if run.out_of_time or not cameras:
         return {}
-    rig, config = run.solution.without_pairs().solved_rig, run.solution.config
     try:
-        checks = check_images(
-            run.dataset, rig, run.correspondences,
-            tolerance=config.tolerance, seed=config.seed, progress=run.progress,
+        evidence = measure_image_evidence(
+            run.dataset, Rig(cameras=cameras), places=table.places, seed=config.seed,
+            progress=run.progress,
         )  # fmt: skip
     except (CalibrationError, OSError) as error:  # files that its matcher did not need
         text = f"the images could not be checked: {error}"
-        return {name: [Check("image evidence", "WARN", text)] for name in rig.cameras}
+        return {name: [Check("image evidence", "WARN", text)] for name in solved}
+    names = {frame.index: frame.name for frame in run.dataset.frames}
+    checks = dict[str, tuple[Check, ...]]()
+    for name, found in evidence.items():
+        seen = replace(found, lens=()) if table.is_swept else found
+        checks[name] = *evidence_checks(seen, names, config.tolerance), *pairing_checks(seen)
     return grade_by_images(run, checks)
-
-
-def check_images(
-    dataset: Dataset,
-    rig: Rig,
-    table: Correspondences,
-    *,
-    tolerance: tuple[float, float] = TOLERANCE,
-    seed: int = 0,
-    progress: Progress | None = None,
-) -> dict[str, tuple[Check, ...]]:
-    """Score images and clouds at the extrinsics of a result, and displaced from them.
-
-    Not observable: a principal point wrong along the shorter side of the image (it is equivalent to
-    a rotation).
-
-    Returns:
-        Checks of every camera but those that a search did not find: theirs is no pose to check.
-    """
-    missed = table.findings.missed
-    cameras = {name: camera for name, camera in rig.cameras.items() if name not in missed}
-    if not cameras:
-        return {}
-    evidence = measure_image_evidence(
-        dataset, Rig(cameras=cameras), places=table.places, seed=seed, progress=progress
-    )
-    if table.is_swept:
-        evidence = {name: replace(found, lens=()) for name, found in evidence.items()}
-    names = {frame.index: frame.name for frame in dataset.frames}
-    return {
-        name: (*evidence_checks(found, names, tolerance), *pairing_checks(found))
-        for name, found in evidence.items()
-    }
 
 
 def evidence_checks(
@@ -319,8 +295,8 @@ def evidence_checks(
         return (Check("image evidence", "WARN", text, found.groups),)
     displaced = threshold("displaced_z_score").check(found.displaced_z_score)
     of_pose = displaced, frames_check(found, names)
-    mispaired = found.frames_best <= limit("lens_frames_best")
-    if found.displaced_z_score < limit("lens_z_score") or mispaired:
+    mispaired = found.frames_best <= LENS_FRAMES_BEST
+    if found.displaced_z_score < LENS_Z_SCORE or mispaired:
         return of_pose  # at a wrong extrinsic the lens cannot be measured
     return *of_pose, *(check_parameter(each, IMAGES, tolerance) for each in found.lens)
 

@@ -9,15 +9,13 @@ the lens and the clock that they were made for. A camera of which none are taken
 
 from __future__ import annotations
 
-import base64
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError
 
-from calibgraph.arrays import Array
 from calibgraph.errors import CorrespondenceError
 from calibgraph.files import describe
 from calibgraph.model.findings import IMAGES
@@ -25,6 +23,7 @@ from calibgraph.model.geometry import pose_difference, twist_between
 from calibgraph.model.lens import has_other_lens, lens_difference
 from calibgraph.model.rig import Camera
 from calibgraph.model.verdict import TOLERANCE, Check
+from calibgraph.solver.solution import Solution
 from calibgraph.trust.evidence import Checks, Evidence
 from calibgraph.trust.pose_posterior import PosePosterior
 
@@ -34,45 +33,15 @@ _EXCLUDED_SIGMAS = 6.0  # of six numbers, by chance three in a million
 _SAME_S = 1e-4  # of both times of the image: such a clock is the same
 
 
-def _read_samples(value: Any) -> Array:
-    """(n, 6) from base64 of half precision, a tenth of the digits' size."""
-    if not isinstance(value, str):
-        raise ValueError("expected base64")
-    samples = np.frombuffer(base64.b64decode(value, validate=True), "<f2")
-    if not len(samples) or len(samples) % 6 or not np.isfinite(samples).all():
-        raise ValueError("expected base64 of finite (n, 6) half-precision numbers")
-    return samples.reshape(-1, 6).astype(np.float64)
-
-
-def _write_samples(samples: Array) -> str:
-    return base64.b64encode(samples.astype("<f2").tobytes()).decode()
-
-
-_Samples = Annotated[Any, BeforeValidator(_read_samples), PlainSerializer(_write_samples)]
-
-
-class _Posterior(BaseModel):
-    model_config = ConfigDict(extra="forbid")
-
-    near: _Samples
-    elsewhere: _Samples
-    share: Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
-
-    def about(self, seen: Camera, camera: Camera) -> PosePosterior:
-        """The posterior of a camera that has another pose than the one that was seen."""
-        away = twist_between(seen.T_camera_lidar, camera.T_camera_lidar)
-        return PosePosterior(self.near + away, self.elsewhere + away, self.share)
-
-
 class _Seen(BaseModel):
     """One camera: how it was when its images were looked at, and what they said."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", arbitrary_types_allowed=True)
 
     camera: Camera
     causes: tuple[Check, ...] = ()
     checks: tuple[Check, ...] = ()
-    posterior: _Posterior | None = None
+    posterior: PosePosterior | None = None
 
 
 @dataclass(frozen=True)
@@ -111,16 +80,16 @@ class ImageRecord(BaseModel):
         except ValidationError as error:
             raise CorrespondenceError(f"metadata {IMAGES!r}: {describe(error)}") from error
 
-    def posteriors_of(
-        self, cameras: Mapping[str, Camera], groups: Sequence[Sequence[str]]
-    ) -> dict[str, PosePosterior]:
+    def posteriors_of(self, solution: Solution) -> dict[str, PosePosterior]:
         """The posteriors about solved cameras that have the lens that was looked at."""
+        solved = {} if solution.covariance is None else solution.solved_rig.cameras
+        both = {n: (of, solved[n]) for n, of in self.cameras.items() if n in solved}
         return {
-            name: seen.posterior.about(seen.camera, cameras[name])
-            for name, seen in self.cameras.items()
-            if any(name in group for group in groups)
-            and seen.posterior
-            and _same_lens(seen.camera, cameras[name])
+            name: of.posterior.from_another(
+                twist_between(of.camera.T_camera_lidar, camera.T_camera_lidar)
+            )
+            for name, (of, camera) in both.items()
+            if name not in solution.held and of.posterior and _same_lens(of.camera, camera)
         }
 
     def checks(self, evidence: Evidence, of_solution: Checks) -> RunChecks:
@@ -167,7 +136,7 @@ class ImageRecord(BaseModel):
         )
         why = next((text for differs, text in differences if differs), "")
         if why and of.posterior and same_lens and same_clock and covariance is not None:
-            total = of.posterior.about(seen, seen).moments + covariance
+            total = of.posterior.moments + covariance
             if away @ np.linalg.solve(total, away) >= _EXCLUDED_SIGMAS**2:
                 text = (
                     f"its images exclude this pose: with them it was {apart} away; the table was "
@@ -180,16 +149,12 @@ class ImageRecord(BaseModel):
 def to_metadata(evidence: Evidence, checks: RunChecks) -> dict[str, Any]:
     """The record of a run, as a key of its table's metadata."""
     cameras = evidence.solution.solved_rig.cameras
-    posteriors = {
-        name: _Posterior.model_construct(near=of.near, elsewhere=of.elsewhere, share=of.share)
-        for name, of in evidence.posteriors.items()
-    }
     seen = {
         name: _Seen.model_construct(
             camera=cameras[name].model_copy(update={"covariance": None}),
             causes=tuple(checks.causes.get(name, ())),
             checks=tuple(checks.of_run.get(name, ())),
-            posterior=posteriors.get(name),
+            posterior=evidence.posteriors.get(name),
         )
         for name in evidence.cameras
     }
@@ -213,10 +178,8 @@ def _same_lens(seen: Camera, camera: Camera) -> bool:
         return True
     if (seen.width_px, seen.height_px) != (camera.width_px, camera.height_px):
         return False
-    columns, rows = (
-        np.linspace(0.0, size - 1.0, _GRID) for size in (seen.width_px, seen.height_px)
-    )
-    pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+    sides = [np.linspace(0.0, size - 1.0, _GRID) for size in (seen.width_px, seen.height_px)]
+    pixels = np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 2)
     apart = np.hypot(*lens_difference(seen, camera, pixels).T)
     known = apart[np.isfinite(apart)]
     return bool(len(known)) and float(known.max()) <= _SAME_PX

@@ -125,8 +125,7 @@ def count_points_in_view(rig: Rig, cloud: Cloud) -> dict[str, int]:
     """Per camera, the number of cloud points in the image at the guess."""
     counts, points = {}, cloud[:, :3].astype(np.float64)
     for name, camera in rig.cameras.items():
-        T = camera.T_camera_lidar
-        pixels, valid = camera.lens.project(points @ T[:3, :3].T + T[:3, 3])
+        pixels, valid = camera.lens.project(points, camera.T_camera_lidar)
         counts[name] = int(np.sum(valid & camera.in_image(pixels)))
     return counts
 

@@ -14,6 +14,7 @@ from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
+from scipy.special import softmax
 
 from calibgraph.errors import CalibrationError
 from calibgraph.io.bags import is_bag
@@ -27,7 +28,8 @@ from calibgraph.model.lens import LensSigmas
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.model.verdict import TOLERANCE, Check
 from calibgraph.parallel import map_on_cores
-from calibgraph.solver.columns import ColumnFit, Marginal, block_of, fit_columns
+from calibgraph.solver.columns import block_of, fit_columns
+from calibgraph.solver.lens import MATCH_SHARE
 from calibgraph.trust.evidence import Checks, Evidence, grade_by_images
 from calibgraph.trust.inputs import INTERVAL_S, MAX_FRAMES, registered_twists
 from calibgraph.trust.lens_parameter import (
@@ -39,7 +41,7 @@ from calibgraph.trust.lens_parameter import (
     check_parameter,
     lens_variable,
 )
-from calibgraph.trust.thresholds import limit
+from calibgraph.trust.thresholds import LENS_WRONG
 from factors import Columns
 from factors.columns import CLOCK, OFFSET
 
@@ -118,7 +120,7 @@ def check_offset(
 ) -> Check:
     """The check of an offset; of one that is not determined, it tells how much depends on it."""
     check, size = check_parameter(found, by, tolerance, options), float(found.units[0] * found.size)
-    if found.sigmas[0] < limit("lens_wrong"):
+    if found.sigmas[0] < LENS_WRONG:
         return check
     text = "the time of the images is not determined by these data, and taken for right"
     if size and (moved_cm := _TOLD_S * found.moved[1] / size) > _TOLD_CM:
@@ -140,7 +142,7 @@ def fit_offset(
     places = table.places
     block = block_of(camera, replace(table, frame=places.merge_stationary(table.frame)))
     of_place = place_variance * places.frames_per_place(block.frame_numbers)
-    shared = max(of_place, limit("lens_match_share") * len(block))
+    shared = max(of_place, MATCH_SHARE * len(block))
     fit = fit_columns(block, camera.T_camera_lidar, free, shared_variance=shared)
     return None if fit is None else LensParameter.of(TIME, np.array([sigma_s]), fit.free(0))
 
@@ -191,25 +193,20 @@ def _check_camera(evidence: Evidence, name: str) -> list[Check]:
         camera.T_camera_lidar,
         lens,
         loss_scale=solution.scales[name].loss_scale,
-        shared_variance=max(of_place, limit("lens_match_share") * len(some)),
+        shared_variance=max(of_place, MATCH_SHARE * len(some)),
     )
     if fit is None:
         return []
-    units, freed = np.array(lens.sigmas), _free_each(fit)
-    found = [LensParameter.of(n, units[[*numbers]], freed[n]) for n, numbers in _NUMBERS.items()]
-    found = [each.with_error(_OF_RIGHT.get(each.name, 0.0)) for each in found]
-    tolerance = solution.config.tolerance
-    rest = ([other for other in found if other is not each] for each in found)
-    return [
-        check_parameter(each, RESIDUALS, tolerance, others=others, unseen=each.name in _BY_SCENE)
-        for each, others in zip(found, rest, strict=True)
+    units, singles = np.array(lens.sigmas), {n: of for n, of in _NUMBERS.items() if len(of) == 1}
+    freed = dict(zip(singles, fit.free_each([*singles.values()]), strict=True))
+    found = [
+        LensParameter.of(n, units[[*of]], freed.get(n) or fit.free(*of), _OF_RIGHT.get(n, 0.0))
+        for n, of in _NUMBERS.items()
     ]
-
-
-def _free_each(fit: ColumnFit) -> dict[str, Marginal]:
-    """The fit of each parameter; those of as many numbers together."""
-    freed: dict[str, Marginal] = {}
-    for count in (1, 2):
-        names = [name for name, numbers in _NUMBERS.items() if len(numbers) == count]
-        freed |= zip(names, fit.free_each([_NUMBERS[name] for name in names]), strict=True)
-    return freed
+    blames = softmax([each.evidence for each in found]).tolist()
+    return [
+        check_parameter(
+            each, RESIDUALS, solution.config.tolerance, blame=blame, unseen=each.name in _BY_SCENE
+        )
+        for each, blame in zip(found, blames, strict=True)
+    ]

@@ -25,7 +25,7 @@ from calibgraph.model.lens import LensSigmas
 from calibgraph.model.rig import Camera
 from calibgraph.model.verdict import FAIL_ABOVE, PASS_BELOW, TOLERANCE, Check, Status
 from calibgraph.solver.columns import Marginal
-from calibgraph.trust.thresholds import limit, threshold
+from calibgraph.trust.thresholds import LENS_WRONG, LENS_WRONG_SHARE, threshold
 from factors import Columns
 from factors.columns import ASPECT, CENTRE_X, CENTRE_Y, FOCAL
 
@@ -95,16 +95,15 @@ class LensParameter:
     units: Array
 
     @staticmethod
-    def of(name: str, units: Array, freed: Marginal) -> LensParameter:
-        """Of a fit whose last unknowns have these units; others may be free before them."""
+    def of(name: str, units: Array, freed: Marginal, error: float = 0.0) -> LensParameter:
+        """Of a fit whose last unknowns have these units; others may be free before them.
+
+        ``error`` is a further one of each value, in standard deviations of a calibrated lens.
+        """
         count = len(units)
         values, covariance = _beside_others(name, freed, len(freed.values) - count)
-        twist = freed.compensating[:, -count:] @ values
-        return LensParameter(name, values, np.sqrt(np.diag(covariance)), twist, units)
-
-    def with_error(self, sigma: float) -> LensParameter:
-        """With a further error of each value, in standard deviations of a calibrated lens."""
-        return replace(self, sigmas=np.hypot(self.sigmas, sigma))
+        twist, sigmas = freed.compensating[:, -count:] @ values, np.sqrt(np.diag(covariance))
+        return LensParameter(name, values, np.hypot(sigmas, error), twist, units)
 
     @cached_property
     def moved(self) -> tuple[float, float]:
@@ -129,19 +128,15 @@ class LensParameter:
         """Log likelihood ratio of a wrong value against none at all, to compare parameters by."""
         if not math.isfinite(self.sigma):  # not determined
             return 0.0
-        total = math.hypot(self.sigma, limit("lens_wrong"))
-        z_score = min(self.size / self.sigma, _MOST_SIGMAS)
-        return (z_score * limit("lens_wrong") / total) ** 2 / 2 + math.log(self.sigma / total)
+        return self._log_density(LENS_WRONG) - self._log_density(0.0)
 
-    def probability(
-        self, tolerance: tuple[float, float] = TOLERANCE, others: Sequence[LensParameter] = ()
-    ) -> float:
+    def probability(self, tolerance: tuple[float, float] = TOLERANCE, blame: float = 1.0) -> float:
         """That the parameter is wrong and displaces the camera beyond a tolerance [deg, cm].
 
         What the estimate adds to it: Bayes' rule, of two kinds of lens parameters, usual ones and
         wrong ones. Their errors are normally distributed with mean zero; wrong ones are rare. What
         usual ones do to the pose is in its error bar. Where one of several was wrong, the others
-        look wrong, too, if each is set free alone; it is the one that explains most.
+        look wrong, too, if each is set free alone: ``blame`` is how likely it is this one.
 
         An aspect ratio that no lens has counts even if the camera moves little when it is set free:
         matches from rounds have followed it. At the default tolerance any size of it counts. At a
@@ -149,10 +144,9 @@ class LensParameter:
         default rotation.
         """
         is_wrong, after, before = self._shares_wrong(tolerance)
-        is_this = softmax([self.evidence, *(other.evidence for other in others)])[0]
-        return max(float(is_wrong * is_this) * after - before, 0.0)
+        return max(is_wrong * blame * after - before, 0.0)
 
-    def probability_with_prior(self, tolerance: tuple[float, float] = TOLERANCE) -> float:
+    def probability_with_prior(self, tolerance: tuple[float, float]) -> float:
         """The same with what was probable before: that these data do not show a wrong lens."""
         is_wrong, after, _ = self._shares_wrong(tolerance)
         return is_wrong * after
@@ -166,7 +160,7 @@ class LensParameter:
         if self.name == ASPECT_RATIO:
             wider = min(one / usual for one, usual in zip(tolerance, TOLERANCE, strict=True)) - 1
             counted = math.radians(TOLERANCE[0]) * max(wider, 0.0) / (self.units[0] / 2)
-        wrong, share = limit("lens_wrong"), limit("lens_wrong_share")
+        wrong, share = LENS_WRONG, LENS_WRONG_SHARE
         odds = logit(share) + self._log_density(wrong) - self._log_density(1.0)
         gain = wrong / math.hypot(self.sigma, wrong)
         after = _share_beyond(counted, gain**2 * self.size, gain * self.sigma)
@@ -199,12 +193,12 @@ def _beside_others(name: str, freed: Marginal, others: int) -> tuple[Array, Arra
     if not others or name == ASPECT_RATIO or not np.isfinite(covariance).all():
         return values[last], covariance[last, last]
     wrong = np.array([*product((False, True), repeat=others)])
-    spreads = np.where(wrong, limit("lens_wrong"), 1.0)
+    spreads = np.where(wrong, LENS_WRONG, 1.0)
     total = covariance[first, first] + spreads[:, :, None] ** 2 * np.eye(others)
     gain, misfit = (
         np.linalg.solve(total, each) for each in (covariance[first, last], values[first, None])
     )
-    odds = logit(limit("lens_wrong_share")) * wrong.sum(axis=1)
+    odds = logit(LENS_WRONG_SHARE) * wrong.sum(axis=1)
     fits = values[first] @ misfit[..., 0].T + np.linalg.slogdet(total).logabsdet
     weights = softmax(odds - fits / 2)
     means = values[last] - values[first] @ gain
@@ -233,25 +227,24 @@ def check_parameter(
     tolerance: tuple[float, float] = TOLERANCE,
     options: str = "",
     *,
-    others: Sequence[LensParameter] = (),
+    blame: float = 1.0,
     unseen: bool = False,
 ) -> Check:
     """Whether a lens parameter is wrong, by RESIDUALS or IMAGES: the value is the probability.
 
-    For a tolerance [deg, cm]; ``options`` are those that its estimate needs, " --interval-s 0.1";
-    ``others`` of its lens have been set free alone, too. ``unseen``: whether what the data do not
-    show counts.
+    For a tolerance [deg, cm]; ``options`` are those that its estimate needs, " --interval-s 0.1".
+    ``unseen``: whether what the data do not show counts.
     """
-    row, probability = threshold("lens"), found.probability(tolerance, others)
+    row, probability = threshold("lens"), found.probability(tolerance, blame)
     if unseen:  # it blames no lens
         probability = max(probability, min(found.probability_with_prior(tolerance), row.warn))
     deg, cm = found.moved
-    status, (part, *_) = row.grade(probability), _WORDS[found.name]
     text = f"by the {by}, {found.describe()}; the camera would move by {deg:.2g} deg, {cm:.2g} cm"
-    if status != "PASS":
-        advice = "correct the time stamps" if found.name == TIME else row.advice
-        text += f": {advice}" + (f"; or run with --estimate {part}{options}" if part else "")
-    check = row.describe(probability, status, text, name=f"{found.name} by the {by}: {row.name}")
+    advice = "correct the time stamps" if found.name == TIME else row.advice
+    if part := _WORDS[found.name][0]:
+        advice += f"; or run with --estimate {part}{options}"
+    name = f"{found.name} by the {by}: {row.name}"
+    check = row.check(probability, text, name=name, advice=advice)
     return replace(check, kind=KINDS[by, found.name])
 
 

@@ -98,7 +98,7 @@ def _share_checks(findings: MatcherFindings, camera: str) -> list[Check]:
          "of the frames failed to be matched"),
     )  # fmt: skip
     return [
-        threshold(key).check_in_words(
+        threshold(key).check(
             share, f"{'an unknown share' if math.isnan(share) else f'{share:.0%}'} {text}"
         )
         for key, share, text in shares

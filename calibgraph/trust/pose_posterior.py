@@ -12,13 +12,16 @@ mean, not the sum: with that the truth is as likely under it as by one camera al
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
+from typing import Annotated, Any
 
 import gtsam
 import numpy as np
+from pydantic import BeforeValidator, Field, PlainSerializer
 from scipy.optimize import brentq
 from scipy.special import expit, logsumexp
 
@@ -100,9 +103,26 @@ class FrameScorer:
         )
 
 
+def _read_samples(value: Any) -> Any:
+    """(n, 6) from base64 of half precision, a tenth of the digits' size."""
+    if not isinstance(value, str):
+        raise ValueError("expected base64")
+    samples = np.frombuffer(base64.b64decode(value, validate=True), "<f2")
+    if not len(samples) or len(samples) % 6 or not np.isfinite(samples).all():
+        raise ValueError("expected base64 of finite (n, 6) half-precision numbers")
+    return samples.reshape(-1, 6).astype(np.float64)
+
+
+def _write_samples(samples: Array) -> str:
+    return base64.b64encode(samples.astype("<f2").tobytes()).decode()
+
+
+_Samples = Annotated[Array, BeforeValidator(_read_samples), PlainSerializer(_write_samples)]
+
+
 @dataclass(frozen=True, eq=False)
 class PosePosterior:
-    """The posterior of a camera's pose about a result, as twists from it.
+    """The posterior of a camera's pose about a result, as twists from it; a file has its samples.
 
     Attributes:
         near: (n, 6) samples, if the rounds ended where the matches say.
@@ -112,10 +132,14 @@ class PosePosterior:
             question; infinite if there is none.
     """
 
-    near: Array
-    elsewhere: Array
-    share: float
-    log_ratio: float = np.inf
+    near: _Samples
+    elsewhere: _Samples
+    share: Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
+    log_ratio: Annotated[float, Field(exclude=True)] = np.inf
+
+    def from_another(self, away: Array) -> PosePosterior:
+        """The same posterior about a pose from which that of the samples is a (6,) twist away."""
+        return replace(self, near=self.near + away, elsewhere=self.elsewhere + away)
 
     @property
     def moments(self) -> Array:
@@ -249,13 +273,6 @@ def _factor(covariance: Array, moments: Array) -> Array:
     ratios, axes = np.linalg.eigh(inverse @ moments @ inverse.T)
     stretch = axes * np.sqrt(np.maximum(ratios, 1.0)) @ axes.T
     return np.asarray(root @ stretch @ inverse)
-
-
-MeasurePosteriors = Callable[
-    [Mapping[str, Array], Sequence[Sequence[str]]], Mapping[str, PosePosterior]
-]
-"""The posteriors by the images, of the (6, 6) covariances by the matches and of groups of cameras
-that move together."""
 
 
 _EFFECTIVE = 0.8  # share of the samples that each step keeps

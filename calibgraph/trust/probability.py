@@ -58,11 +58,6 @@ def judge(
     return Verdict(tuple(checks), ErrorProbability(of_checks, beyond, *tolerance, bar_odds=odds))
 
 
-def model_of(matcher: str) -> str:
-    """The model for a run, by the name of its matcher."""
-    return STRUCTURE if matcher == STRUCTURE else TABLES
-
-
 def probability_of_checks(checks: Sequence[Check], model: str) -> float:
     """The probability that a result is wrong, by its checks; 1 if one is decisive."""
     if any(check.decisive for check in checks):

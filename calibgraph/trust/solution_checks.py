@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from calibgraph.arrays import Array
 from calibgraph.model.calibration import Residuals
-from calibgraph.model.geometry import camera_center
+from calibgraph.model.config import Terms
+from calibgraph.model.geometry import camera_center, degrees_and_centimetres
 from calibgraph.model.lens import LensEstimate
 from calibgraph.model.rig import Camera
 from calibgraph.model.verdict import COMMON_ERROR, Check
@@ -16,7 +18,7 @@ from calibgraph.solver.error_model import Conflict
 from calibgraph.solver.matches import CameraBlock
 from calibgraph.solver.robust import quantile
 from calibgraph.solver.solution import Solution
-from calibgraph.trust.evidence import Checks, Estimate, Evidence
+from calibgraph.trust.evidence import Checks, Evidence
 from calibgraph.trust.thresholds import threshold
 from factors.columns import CLOCK
 from factors.conditioning import invert_or_none
@@ -33,87 +35,104 @@ _SHALLOW = 2.0  # ratio of far to near
 
 def estimate_checks(evidence: Evidence) -> Checks:
     """The checks of every camera's estimate."""
-    return {name: check_estimate(_estimate_of(evidence, name)) for name in evidence.cameras}
+    solution, checks = evidence.solution, {}
+    unknown = evidence.joint_covariance is None
+    for name in evidence.cameras:
+        block, own = solution.inliers.blocks.get(name), solution.fitted.frame_sums.get(name)
+        used, held = 0 if block is None else len(block), name in solution.held
+        if held or name not in solution.objective.blocks:
+            excluded = name in evidence.excluded
+            checks[name] = [_check_unmeasured(used, held=held, excluded=excluded)]
+            continue
+        checks[name] = check_estimate(
+            used=used,
+            frames=0 if block is None else block.frames,
+            covariance=evidence.covariance_by_matches(name),
+            is_free=unknown and own is not None and invert_or_none(own.hessian.sum(0)) is None,
+            conflicts=[one for one in solution.conflicts if name in (one.pair.a, one.pair.b)],
+            converged=solution.optimum.converged,
+            terms=solution.terms,
+            scatter_only=not evidence.findings.states_common_error,
+            tolerance=solution.config.tolerance,
+            lens=solution.lens.get(name, ()),
+        )
+    return checks
 
 
-def _estimate_of(evidence: Evidence, camera: str) -> Estimate:
-    solution, block = evidence.solution, evidence.solution.inliers.blocks.get(camera)
-    unknown, own = evidence.joint_covariance is None, solution.fitted.frame_sums.get(camera)
-    return Estimate(
-        has_matches=camera in solution.objective.blocks,
-        used=0 if block is None else len(block.frame),
-        frames=0 if block is None else len(block.frame_edges) - 1,
-        covariance=evidence.covariance_by_matches(camera),
-        is_free=unknown and own is not None and invert_or_none(own.hessian.sum(axis=0)) is None,
-        conflicts=tuple(c for c in solution.conflicts if camera in (c.pair.a, c.pair.b)),
-        converged=solution.optimum.converged,
-        terms=solution.terms,
-        held=camera in solution.held,
-        excluded=camera in evidence.excluded,
-        scatter_only=not evidence.findings.states_common_error,
-        tolerance=solution.config.tolerance,
-        lens=solution.lens.get(camera, ()),
-    )
-
-
-def _check_unmeasured(estimate: Estimate) -> Check:
-    """The check of a camera without correspondences of its own."""
-    excluded, used = estimate.excluded, f"{estimate.used} usable correspondences, too few"
-    kind, why = ("excluded", "excluded by the settings") if excluded else ("", used)
-    if estimate.held:
+def _check_unmeasured(used: int, *, held: bool, excluded: bool) -> Check:
+    """The check of a camera without correspondences of its own, or that nothing determines."""
+    few = f"{used} usable correspondences, too few"
+    kind, why = ("excluded", "excluded by the settings") if excluded else ("", few)
+    if held:
         text = f"{why}, and nothing ties it to another camera: it is left at its guess"
         if not excluded:
             text += (
                 "; check that its images show something sharp, that the cloud lies where "
                 "T_camera_lidar looks, and its name"
             )
-        return Check("correspondences", "FAIL", text, estimate.used, kind=kind)
+        return Check("correspondences", "FAIL", text, used, kind=kind)
     text = (
         f"{why}: determined by other cameras alone, through relative_poses, which have to be "
         "right, or what they see in common"
     )
-    return Check("correspondences", "WARN", text, estimate.used, kind=kind)
+    return Check("correspondences", "WARN", text, used, kind=kind)
 
 
-def check_estimate(estimate: Estimate) -> list[Check]:
-    """The checks of one camera's estimate, from a batch solve or while driving."""
-    if estimate.held or not estimate.has_matches:
-        return [_check_unmeasured(estimate)]
-    checks = [] if estimate.covariance is None else _check_sigmas(estimate)
-    if estimate.scatter_only and checks:
+def check_estimate(  # noqa: PLR0913 - what a batch or the tracker knows of one camera
+    *,
+    used: int,
+    frames: int,
+    covariance: Array | None,
+    is_free: bool,
+    conflicts: Sequence[Conflict],
+    scatter_only: bool,
+    tolerance: tuple[float, float],
+    converged: bool = True,
+    terms: Terms = "full",
+    lens: Sequence[LensEstimate] = (),
+) -> list[Check]:
+    """The checks of one camera's estimate, from a batch solve or while driving.
+
+    Args:
+        used: correspondences in the final solve.
+        frames: that they come from.
+        covariance: (6, 6) of (rotation [rad], translation [m]), or None.
+        is_free: whether its correspondences do not determine it.
+        conflicts: of the relative poses that name this camera.
+        scatter_only: whether it is unknown how large the error is that all frames share.
+        tolerance: of the user: rotation [deg] and distance [cm].
+        converged: whether the optimizer did.
+        terms: of the objective.
+        lens: the parameters of lens and clock that were estimated.
+    """
+    checks = [] if covariance is None else _check_sigmas(covariance, tolerance)
+    if scatter_only and checks:
         text = (
             "scatter only: the table states no error that its frames share, so that the true error "
             "may be many times the error bar"
         )
         checks.append(Check("common error", "WARN", text, kind=COMMON_ERROR))
-    checks += map(_check_relative_pose, estimate.conflicts)
-    if estimate.terms in ("stage1", "priors"):
-        text = f"the terms {estimate.terms!r} do not fit the correspondences: no error bar"
+    checks += map(_check_relative_pose, conflicts)
+    if terms in ("stage1", "priors"):
+        text = f"the terms {terms!r} do not fit the correspondences: no error bar"
         checks.append(Check("terms", "WARN", text))
-    elif estimate.covariance is None:
-        checks.append(_check_free(estimate.is_free))
-    counts = threshold("correspondences_used"), threshold("frames")
-    checks += [counts[0].check(estimate.used), counts[1].check(estimate.frames)]
-    checks += map(_check_lens_prior, estimate.lens)
-    text = f"the optimizer {'converged' if estimate.converged else 'did not converge'}"
-    return [*checks, Check("convergence", "PASS" if estimate.converged else "FAIL", text)]
-
-
-def _check_sigmas(estimate: Estimate) -> list[Check]:
-    """The error bar about its worst axes, of rotation and of translation."""
-    sigmas = np.sqrt(np.diag(estimate.covariance))  # type: ignore[arg-type]
-    values = ("rotation", np.degrees(sigmas[:3].max())), ("translation", 100 * sigmas[3:].max())
-    rows = [(threshold(f"sigma_{part}", estimate.tolerance), float(v)) for part, v in values]
-    return [row.check(value) for row, value in rows]
-
-
-def _check_free(is_free: bool) -> Check:
-    """The check of an estimate without an error bar."""
-    if is_free:
+    elif covariance is None and is_free:
         text = "the correspondences leave directions of the pose free"
-        return Check("error bar", "FAIL", text, kind="free")
-    text = "no error bar: the correspondences leave the pose of another camera free"
-    return Check("error bar", "WARN", text, kind="no_error_bar")
+        checks.append(Check("error bar", "FAIL", text, kind="free"))
+    elif covariance is None:
+        text = "no error bar: the correspondences leave the pose of another camera free"
+        checks.append(Check("error bar", "WARN", text, kind="no_error_bar"))
+    checks.append(threshold("correspondences_used").check(used))
+    checks.append(threshold("frames").check(frames))
+    checks += map(_check_lens_prior, lens)
+    text = f"the optimizer {'converged' if converged else 'did not converge'}"
+    return [*checks, Check("convergence", "PASS" if converged else "FAIL", text)]
+
+
+def _check_sigmas(covariance: Array, tolerance: tuple[float, float]) -> list[Check]:
+    """The error bar about its worst axes, of rotation and of translation."""
+    values = zip(("rotation", "translation"), degrees_and_centimetres(covariance), strict=True)
+    return [threshold(f"sigma_{part}", tolerance).check(float(v.max())) for part, v in values]
 
 
 def _check_relative_pose(conflict: Conflict) -> Check:
@@ -125,7 +144,7 @@ def _check_relative_pose(conflict: Conflict) -> Check:
         f"the correspondences contradict the measured {name} by "
         f"{degrees:.2g} deg, {centimetres:.2g} cm, {sigmas:.3g} sigma"
     )
-    return threshold("relative_pose").check_in_words(sigmas, text, name=name)
+    return threshold("relative_pose").check(sigmas, text, name=name)
 
 
 def _check_lens_prior(one: LensEstimate) -> Check:

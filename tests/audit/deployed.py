@@ -1,12 +1,11 @@
 """A deployed calibration, and how it moves."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 import calibgraph
 from calibgraph import Rig
+from calibgraph.model.geometry import transform
 from tests.conftest import SAMPLE
 
 TRUTH = calibgraph.load_rig(SAMPLE / "reference.yaml")
@@ -14,10 +13,8 @@ TRUTH = calibgraph.load_rig(SAMPLE / "reference.yaml")
 
 def motion(axis: int, degrees: float = 0.0, metres: float = 0.0) -> np.ndarray:
     """(4, 4) about and along one axis."""
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_rotvec(np.radians(degrees) * np.eye(3)[axis]).as_matrix()
-    T[axis, 3] = metres
-    return T
+    way = np.eye(3)[axis]
+    return transform(Rotation.from_rotvec(degrees * way, degrees=True), metres * way)
 
 
 def with_camera_moved(rig: Rig, name: str, T: np.ndarray) -> Rig:

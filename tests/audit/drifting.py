@@ -1,7 +1,5 @@
 """Results of one rig, with errors drawn from their covariances."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache

@@ -1,9 +1,8 @@
 """The audit of a deployed calibration, on the sample: its answer, its rounds, its origin."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -13,6 +12,7 @@ import pytest
 import calibgraph
 from calibgraph import Audit, Correspondences, Dataset, Rig, simulate_correspondences
 from calibgraph.audit.check import match_from_deployed, provenance
+from calibgraph.io.dataset import keep_frames
 from calibgraph.matching.protocol import FullMatcher
 from calibgraph.matching.structure.matcher import StructureMatcher
 from calibgraph.model.config import Config
@@ -25,6 +25,12 @@ from tests.matching.structure.data import with_noise_images
 TABLE = simulate_correspondences(TRUTH, frames=6)
 
 
+@cache
+def sample() -> Dataset:
+    """The sample, whose features are found once."""
+    return keep_frames(calibgraph.load_dataset(SAMPLE, TRUTH))
+
+
 def with_lidar_moved(rig: Rig, T: np.ndarray) -> Rig:
     """The rig as deployed before the LiDAR moved by T, in its own axes."""
     return rig.moved_to({name: old @ np.linalg.inv(T) for name, old in rig.T_camera_lidar.items()})
@@ -32,7 +38,7 @@ def with_lidar_moved(rig: Rig, T: np.ndarray) -> Rig:
 
 def check_by_table(deployed: Rig) -> Audit:
     """The audit by simulated correspondences of the truth, and the sample's images."""
-    return calibgraph.check(deployed, SAMPLE, matcher=TABLE)
+    return calibgraph.check(deployed, sample(), matcher=TABLE)
 
 
 def test_a_right_rig_is_ok() -> None:
@@ -101,7 +107,7 @@ def test_a_table_of_another_rig_is_an_error() -> None:
 
 
 def test_correspondences_that_determine_no_camera_cannot_tell() -> None:
-    audit = calibgraph.check(TRUTH, SAMPLE, matcher=TABLE.select(slice(0, 5)))
+    audit = calibgraph.check(TRUTH, sample(), matcher=TABLE.select(slice(0, 5)))
     assert {camera.status for camera in audit.cameras.values()} == {"CANNOT TELL"}
 
 
@@ -133,9 +139,7 @@ def test_a_camera_that_moved_during_the_recording_is_not_ok(tmp_path: Path) -> N
     data = Path(shutil.copytree(SAMPLE, tmp_path / "data"))
     camera = TRUTH.cameras["front_left"]
     assert not any(camera.distortion)  # a turn of the camera is a homography
-    k = camera.intrinsics_px
-    K = np.array([[k.fx, 0, k.cx], [0, k.fy, k.cy], [0, 0, 1]])
-    turned = K @ motion(1, degrees=1.5)[:3, :3] @ np.linalg.inv(K)
+    turned = camera.matrix_px @ motion(1, degrees=1.5)[:3, :3] @ np.linalg.inv(camera.matrix_px)
     for path in sorted((data / "cameras" / "front_left").iterdir())[3:]:
         image = cv2.imread(str(path))
         cv2.imwrite(str(path), cv2.warpPerspective(image, turned, image.shape[1::-1]))
@@ -147,7 +151,7 @@ def test_a_camera_that_moved_during_the_recording_is_not_ok(tmp_path: Path) -> N
 
 
 def test_copies_of_a_frame_are_left_out_and_named(caplog: pytest.LogCaptureFixture) -> None:
-    data = calibgraph.load_dataset(SAMPLE, TRUTH)
+    data = sample()
     copied = [replace(data.frames[0], index=100 + k, name=f"copy{k}") for k in range(2)]
     data = replace(data, frames=(*data.frames, *copied))
     assert calibgraph.check(TRUTH, data, matcher=TABLE).frames == 6
@@ -179,10 +183,10 @@ class MatcherOfTruth:
 
 def rounds_from(deployed: Rig, matcher: MatcherOfTruth) -> list[int]:
     """The rounds that are run from a deployed rig."""
-    data, config = calibgraph.load_dataset(SAMPLE, TRUTH), Config().changed(stage1="rig")
     match_from_deployed(
-        data, deployed, FullMatcher(matcher), config, watch=Stopwatch(), progress=no_progress
-    )
+        sample(), deployed, FullMatcher(matcher), Config().changed(stage1="rig"),
+        watch=Stopwatch(), progress=no_progress,
+    )  # fmt: skip
     return matcher.asked
 
 

@@ -1,7 +1,5 @@
 """What the fleet's model learns from vehicles whose deviations are known, from rows of any run."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 

@@ -121,11 +121,10 @@ def test_drift_refuses_results_of_other_lidars():
 
 
 def test_check_measures_lidars_in_a_recording(tmp_path: Path, call: Call):
-    folder = write_vehicle(tmp_path / "data", seed=4, places=2)
-    deployed = result_of(poses_of(1))
-    T = {**deployed.rig.lidars, "left": Lidar(T_base_lidar=MOUNTS["left"] @ STEP @ STEP)}
-    rig = deployed.rig.model_copy(update={"lidars": T})
-    path = replace(deployed, rig=rig).save(tmp_path / "deployed")
+    folder = write_vehicle(tmp_path / "data", seed=4, places=2, without="front")
+    moved = Lidar(T_base_lidar=MOUNTS["left"] @ STEP @ STEP)
+    path = tmp_path / "deployed.yaml"
+    Rig(lidar="top", lidars={"top": Lidar(), "left": moved}).save(path)
     page = tmp_path / "page.html"
     code, out, err = call("check", path, folder, "--tolerance-deg", 0.4, "--tolerance-cm", 5,
                           "--out", page, "--json")  # fmt: skip

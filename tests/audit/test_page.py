@@ -1,7 +1,5 @@
 """The page of an audit: everything of it, nothing fetched, whatever is missing."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The paper's experiment and its solver: rows, intervals, seeds, failures, its report."""
 
-from __future__ import annotations
-
 import sys
 from dataclasses import asdict, replace
 

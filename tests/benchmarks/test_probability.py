@@ -1,7 +1,5 @@
 """How the probability of being off is judged: cuts, reliability, discrimination."""
 
-from __future__ import annotations
-
 import pytest
 
 from benchmarks.accuracy.ledger import Record

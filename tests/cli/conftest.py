@@ -1,12 +1,10 @@
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from calibgraph import MatcherErrors, Rig, perturb, simulate_correspondences
-from tests.conftest import make_pair
+from tests.conftest import CommandRun, make_pair, run_command
 
 
 def save_problem(folder: Path) -> Path:
@@ -25,6 +23,15 @@ def words_to_solve(folder: Path, rig: Rig, **simulated: Any) -> tuple[str | Path
     rig.save(folder / "rig.yaml")
     simulate_correspondences(rig, **simulated).save(folder / "table.parquet")
     return "solve", folder / "rig.yaml", folder / "table.parquet", "--out", folder / "out"
+
+
+@pytest.fixture(scope="session")
+def solved(tmp_path_factory: pytest.TempPathFactory) -> CommandRun:
+    """``solve`` of the problem, with seed 3; its folder is ``out`` in that of the problem."""
+    problem = save_problem(tmp_path_factory.mktemp("solved"))
+    (problem / "seed.yaml").write_text("seed: 3\n")
+    inputs = problem / "rig.yaml", problem / "table.parquet", "--config", problem / "seed.yaml"
+    return run_command("solve", *inputs, "--out", problem / "out", folder=problem / "out")
 
 
 @pytest.fixture

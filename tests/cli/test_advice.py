@@ -1,7 +1,5 @@
 """Advice runs as printed: each line prints one in its situation, and what it says is then done."""
 
-from __future__ import annotations
-
 import json
 import re
 import shlex

@@ -1,7 +1,5 @@
 """One line for bad input, exit codes, and a fast ``--help``."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys

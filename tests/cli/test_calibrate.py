@@ -1,6 +1,4 @@
-"""calibrate, match and solve: what they print and write, and the exit code of a FAIL."""
-
-from __future__ import annotations
+"""calibrate, match, solve, report, evaluate, perturb: what they print and write; exit codes."""
 
 import json
 from pathlib import Path
@@ -18,20 +16,8 @@ from calibgraph import (
     simulate_correspondences,
 )
 from calibgraph.model.places import Places
-from tests.cli.conftest import error_line, save_problem, words_to_solve
-from tests.conftest import SAMPLE, Call, CommandRun, make_camera, run_command
-
-
-@pytest.fixture(scope="module")
-def solved(tmp_path_factory: pytest.TempPathFactory) -> CommandRun:
-    """``solve`` of the problem, with seed 3."""
-    problem = save_problem(tmp_path_factory.mktemp("problem"))
-    out = problem / "result"
-    (problem / "seed.yaml").write_text("seed: 3\n")
-    return run_command(
-        "solve", problem / "rig.yaml", problem / "table.parquet", "--out", out,
-        "--config", problem / "seed.yaml", folder=out,
-    )  # fmt: skip
+from tests.cli.conftest import error_line, words_to_solve
+from tests.conftest import SAMPLE, Call, CommandRun, make_camera, require_poses
 
 
 def test_solve_then_evaluate(solved: CommandRun, call: Call) -> None:
@@ -58,7 +44,9 @@ def test_solve_then_evaluate(solved: CommandRun, call: Call) -> None:
     assert "left->right" in table
 
 
-def test_a_prior_from_the_same_data_is_warned_of(solved: CommandRun, call: Call) -> None:
+def test_a_prior_from_the_same_data_is_warned_of(
+    solved: CommandRun, tmp_path: Path, call: Call
+) -> None:
     """With an estimate of the lens: a guess alone is no prior. Also of a copy of the table."""
     problem, note = solved.folder.parent, "was made from the same data"
     table, kept = problem / "table.parquet", solved.folder / "correspondences.parquet"
@@ -68,7 +56,7 @@ def test_a_prior_from_the_same_data_is_warned_of(solved: CommandRun, call: Call)
         (solved.folder, table, (), False),
         (problem / "rig.yaml", table, ("--estimate", "focal"), False),
     ):
-        out = problem / "again"
+        out = tmp_path / "again"
         _, _, err = call("solve", rig, given, *options, "--out", out)
         assert (note in err) == warned
         assert any(note in text for text in load_calibration(out).warnings) == warned
@@ -86,8 +74,7 @@ def test_the_result_file_is_complete_and_returns_the_result(solved: CommandRun) 
     assert result.verdict.status == "PASS"
     assert result.covariance["left"].shape == (6, 6)
     rig = load_rig(out)
-    for name, T in result.T_camera_lidar.items():
-        np.testing.assert_array_equal(rig.T_camera_lidar[name], T)
+    require_poses(rig.T_camera_lidar, result.T_camera_lidar, atol=0)
 
 
 def test_json_is_on_stdout_and_complete(problem: Path, call: Call) -> None:
@@ -171,3 +158,32 @@ def test_match_writes_a_table(call: Call, tmp_path: Path) -> None:
                       "--frames", "0:3", "--out", tmp_path / "part.csv")  # fmt: skip
     assert code == 0
     assert set(load_correspondences(tmp_path / "part.csv").frame.tolist()) == {0, 1, 2}
+
+
+def test_perturb_is_repeatable(problem: Path, call: Call) -> None:
+    for name in ("one.yaml", "two.yaml"):
+        code, _, _ = call(
+            "perturb", problem / "truth.yaml", "--rotation-deg", 5, "--translation-m", 0.3,
+            "--seed", 4, "--out", problem / name,
+        )  # fmt: skip
+        assert code == 0
+    assert (problem / "one.yaml").read_text() == (problem / "two.yaml").read_text()
+    code, stdout, _ = call("evaluate", problem / "one.yaml", problem / "truth.yaml", "--json")
+    for error in json.loads(stdout)["cameras"].values():
+        assert error["rotation_error_deg"] == pytest.approx(5)
+
+
+def test_report_writes_the_same_page_again(pair: Rig, call: Call, tmp_path: Path) -> None:
+    nonsense, out = MatcherErrors(outlier_share=1.0), tmp_path / "out"
+    code, _, err = call(*words_to_solve(tmp_path, pair, errors=nonsense))
+    assert code == 1
+    assert str(out / "report.html") in err.replace("\n", "")
+    page = (out / "report.html").read_text()
+    (out / "report.html").unlink()
+    code, _, err = call("report", out)
+    assert code == 0
+    assert "the verdict is FAIL" in err
+    assert (out / "report.html").read_text() == page  # the files hold everything on the page
+    code, _, _ = call("report", out / "calibration.yaml", "--out", tmp_path / "other.html")
+    assert code == 0
+    assert (tmp_path / "other.html").read_text() == page

@@ -1,7 +1,5 @@
 """check: its exit codes, table and JSON."""
 
-from __future__ import annotations
-
 import json
 import re
 import sys

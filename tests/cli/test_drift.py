@@ -1,7 +1,5 @@
 """drift: its exit codes, table and JSON."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

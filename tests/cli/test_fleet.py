@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -7,7 +5,6 @@ import pytest
 
 from calibgraph.child_process import Outcome
 from calibgraph.fleet.files import read_rows
-from tests.cli.conftest import error_line
 from tests.conftest import Call
 from tests.draws.fleets import run_here, write_fleet
 
@@ -38,21 +35,3 @@ def test_failed_jobs_exit_1(call: Call, tmp_path: Path, monkeypatch: pytest.Monk
     code, _, err = call("fleet", str(tmp_path / "fleet.csv"), "--out", str(tmp_path / "out"))
     assert code == 1
     assert "failed: 1 (bad input); see the column error, and _logs" in err
-
-
-@pytest.mark.parametrize(
-    ("text", "options", "message"),
-    [
-        ("vehicle\na\n", [], "column 'recording' is missing"),
-        ("vehicle,recording\na,.\n", ["--dask", "nonsense://x"], "--dask nonsense://x: no sched"),
-        ("vehicle,recording\na,.\n", ["--dask", "tcp://x:1", "--jobs", "2"], "--jobs is of this"),
-    ],
-)
-def test_wrong_input_is_one_line_and_writes_nothing(
-    call: Call, tmp_path: Path, text: str, options: list[str], message: str
-) -> None:
-    (tmp_path / "fleet.csv").write_text(text)
-    out = tmp_path / "out"
-    result = call("fleet", str(tmp_path / "fleet.csv"), "--out", str(out), *options)
-    assert message in error_line(*result)
-    assert not out.exists()

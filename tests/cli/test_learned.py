@@ -1,7 +1,5 @@
 """`calibrate` with the matcher cmrnext."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -1,11 +1,11 @@
 """What is wrong in a command line is said in one line, with exit code 2, and nothing is written."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
 
+from calibgraph import load_dataset
+from calibgraph.pick.server import Workspace
 from tests.cli.conftest import error_line
 from tests.conftest import SAMPLE, Call
 from tests.io.bags.writing import sample_bag
@@ -18,7 +18,7 @@ calibrate | missing argument
 calibrate {sample} --colour red | see calibgraph calibrate --help
 calibrat {sample} | see calibgraph --help
 evaluate | see calibgraph evaluate --help
-calibrate {sample} --matcher magic | unknown matcher 'magic'
+calibrate {sample} --matcher magic | unknown matcher 'magic'; known are 'structure', 'cmrnext' and a
 calibrate {sample} --frames 9: | frames '9:'
 calibrate nothing | no such folder
 calibrate {sample} --every-s 2 | are given without a bag
@@ -80,6 +80,13 @@ check {sample} missing | missing
 check {sample} {sample} --tolerance-deg 0 | tolerance_deg must be positive
 check {sample} {sample} --tolerance-cm nan | tolerance_cm must be positive
 check {sample} {sample} --out check.txt | must end in .html
+pick nothing --out session --no-show | no such folder
+pick {sample} --out session --frames 99 --no-show | frames '99'
+pick {sample} --out picked --no-show | session of other frames or cameras
+pick {sample} --out bad.yaml --no-show | bad.yaml
+fleet lacking.csv --out never | column 'recording' is missing
+fleet fleet.csv --out never --dask nonsense://x | --dask nonsense://x: no sched
+fleet fleet.csv --out never --dask tcp://x:1 --jobs 2 | --jobs is of this
 report nothing | no such file
 report {sample} | calibration.yaml: no such file
 simulate nowhere --out never | unknown scenario 'nowhere'; known is street
@@ -104,6 +111,9 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "half.parquet").write_bytes((folder / "table.parquet").read_bytes()[:1000])
     (folder / "bad.yaml").write_text("format: calibgraph-rig/1\ncameras: {a: {fov: 3}}\n")
     (folder / "empty").mkdir()
+    (folder / "lacking.csv").write_text("vehicle\na\n")
+    (folder / "fleet.csv").write_text("vehicle,recording\na,.\n")
+    Workspace(load_dataset(SAMPLE, frames=":2"), folder / "picked").change([])
     for name, text in CONFIGS.items():
         (folder / f"{name}.yaml").write_text(f"{text}\n")
     write(folder, info__yaml=CAMERA_INFO, chain__yaml=KALIBR, degrees__urdf=DEGREES)

@@ -1,27 +1,29 @@
-"""rig: from a folder to fill in, a bag, or files of other programs."""
-
-from __future__ import annotations
+"""rig, from a folder to fill in, a bag, or files of other programs; export; the way between."""
 
 import json
+import re
 import shutil
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 import yaml
 
-from calibgraph import load_rig, write_rig_template
+from calibgraph import load_calibration, load_rig, write_rig_template
 from tests.cli.conftest import error_line
-from tests.conftest import SAMPLE, Call
+from tests.conftest import SAMPLE, Call, require_near, require_poses
 from tests.io.bags.writing import (
     START_NS,
     Messages,
     Stamped,
     sample_bag,
     sample_messages,
+    without,
     write_bag,
 )
 from tests.io.formats.calibration_files import CAMERA_INFO, KALIBR, KOIDE, SENTENCE, URDF, write
+from tests.io.formats.readers import READERS
 
 
 @pytest.fixture
@@ -87,9 +89,7 @@ def test_a_bag_is_listed_and_its_rig_is_written(call: Call, tmp_path: Path) -> N
     assert code == 0
     assert "/points  sensor_msgs/msg/PointCloud2  6\n" in err
     assert "left looks along LiDAR +y, 14 deg to the right" in err
-    for name, camera in load_rig(SAMPLE).cameras.items():
-        T = load_rig(out).cameras[name].T_camera_lidar
-        np.testing.assert_allclose(T, camera.T_camera_lidar, atol=1e-12)
+    require_poses(load_rig(out).T_camera_lidar, load_rig(SAMPLE).T_camera_lidar, atol=1e-12)
     code, stdout, err = call("rig", bag, "--json")
     assert (code, err) == (0, "")
     found = json.loads(stdout)
@@ -155,3 +155,44 @@ def test_millimetres_are_warned_of_by_rig_and_export(call: Call, tmp_path: Path)
                         tmp_path / "kit.yaml", *pose)  # fmt: skip
     assert (code, err.count(said)) == (0, 1)
     assert "warning: --lidar-pose '0 0 1800 0 0 0': lengths in millimetres?" in err
+
+
+MOUNTED = {"front_left": "front, 0.4 m ahead", "front_right": "front, 0.4 m ahead", "left": "left"}
+
+
+@pytest.mark.slow
+def test_a_bag_without_transforms(call: Call, tmp_path: Path) -> None:
+    """The second command is as the first proposed it; frames are those of the bag."""
+    bag = write_bag(tmp_path, "mcap", without(sample_messages(Messages("mcap")), "/tf_static"))
+    rig, out, launch = tmp_path / "rig.yaml", tmp_path / "result", tmp_path / "rig.launch.xml"
+    words = [part for name, text in MOUNTED.items() for part in ("--mount", f"{name}={text}")]
+    code, _, said = call("rig", bag, *words, "--out", rig)
+    proposed = re.search(r"--search-deg \S+ --search-m \S+", said)
+    assert code == 0 and proposed is not None
+    assert call("calibrate", bag, "--rig", rig, *proposed[0].split(), "--out", out)[0] == 0
+    assert call("export", out, "--format", "ros2-launch", "--out", launch)[0] == 0
+    nodes = ElementTree.parse(launch).getroot().iter("node")
+    frames = [node.attrib["args"].split()[-1] for node in nodes]
+    assert frames == [f"{name}_optical" for name in MOUNTED]
+    truth = load_rig(SAMPLE / "reference.yaml")
+    # 1 px
+    require_near(load_calibration(out).rig, truth, deg=0.12, cm=3)
+
+
+def test_a_rig_is_exported_and_the_file_named(call: Call, tmp_path: Path) -> None:
+    out = tmp_path / "robot.urdf"
+    code, stdout, err = call("export", SAMPLE, "--format", "urdf", "--out", out)
+    assert (code, stdout, err) == (0, "", f"{out}: written (urdf)\n")
+    require_poses(READERS["urdf"](out), load_rig(SAMPLE).T_camera_lidar, atol=1e-9)
+
+
+def test_options_of_export_reach_the_file(call: Call, tmp_path: Path) -> None:
+    out = tmp_path / "kit.yaml"
+    code, _, _ = call(
+        "export", SAMPLE, "--format", "autoware", "--out", out, "--camera", "left",
+        "--lidar-frame", "velodyne_top", "--lidar-pose", "1 2 3 0 0 0.5",
+    )  # fmt: skip
+    assert code == 0
+    kit = yaml.safe_load(out.read_text())["sensor_kit_base_link"]
+    assert list(kit) == ["velodyne_top", "left/camera_link"]
+    assert [kit["velodyne_top"][key] for key in ("x", "y", "z")] == [1, 2, 3]

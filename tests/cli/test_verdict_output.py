@@ -1,7 +1,5 @@
 """What the command line and the files show of a verdict."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

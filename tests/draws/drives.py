@@ -7,6 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calibgraph.model.correspondences import Correspondences, concatenate
+from calibgraph.model.geometry import transform
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.simulation.correspondences import MatcherErrors, matchers_of
 
@@ -61,8 +62,7 @@ def simulate_drive(
 def _displace(rng: Rng, camera: Camera) -> Camera:
     """The camera at a wrong pose."""
     axis, direction = rng.standard_normal((2, 3))
-    T_delta = np.eye(4)
-    angle = np.radians(rng.uniform(1, 5))
-    T_delta[:3, :3] = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis)).as_matrix()
-    T_delta[:3, 3] = rng.uniform(0.1, 0.5) * direction / np.linalg.norm(direction)
+    turn = rng.uniform(1, 5) * axis / np.linalg.norm(axis)
+    shift_m = rng.uniform(0.1, 0.5) * direction / np.linalg.norm(direction)
+    T_delta = transform(Rotation.from_rotvec(turn, degrees=True), shift_m)
     return camera.moved_to(T_delta @ camera.T_camera_lidar)

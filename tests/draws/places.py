@@ -12,17 +12,17 @@ from calibgraph.model.correspondences import Correspondences, concatenate
 from calibgraph.model.findings import MatcherFindings, error_components
 from calibgraph.model.geometry import relative_transform, to_T_lidar_camera
 from calibgraph.model.places import Places, as_groups
-from calibgraph.model.rig import Camera, Intrinsics, RelativePose, Rig
+from calibgraph.model.rig import Intrinsics, RelativePose, Rig
 from calibgraph.simulation.correspondences import MatcherErrors, simulate_correspondences
 from calibgraph.solver.two_pass import optimize
 from factors import ProjectionBlock, block_factor
+from tests.draws.cameras import camera_at
 
 Rng = np.random.Generator
 
 FRAMES = 3
 SIZES = MatcherFindings(**error_components().matchers["structure"])
 FIFTH = MatcherErrors(noise_px=1.6**0.5, frame_noise_px=0.4**0.5, outlier_share=0.15)
-FORWARD = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 
 
 @dataclass(frozen=True)
@@ -141,12 +141,8 @@ def displaced(rig: Rig, cloud: Array, cameras: Array) -> Rig:
 def stereo() -> Rig:
     """A pair like KITTI's, half a metre apart."""
     lens = Intrinsics(fx=718.0, fy=718.0, cx=607.0, cy=185.0)
-    cameras = {}
-    for name, y_m in (("left", 0.1), ("right", -0.44)):
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = FORWARD, -FORWARD @ [0.3, y_m, -0.1]
-        cameras[name] = Camera(width_px=1241, height_px=376, intrinsics_px=lens, T_camera_lidar=T)
-    return Rig(cameras=cameras)
+    places_m = {"left": (0.3, 0.1, -0.1), "right": (0.3, -0.44, -0.1)}
+    return Rig(cameras={n: camera_at((1241, 376), lens, xyz) for n, xyz in places_m.items()})
 
 
 def tied(drawn: Drawn, rng: Rng, *, deg: float, cm: float) -> Drawn:

@@ -1,7 +1,5 @@
 """The converter of KITTI-360, on a folder of its layout."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -1,7 +1,5 @@
 """The ROS 2 node without ROS: messages of rosbags, and a stand-in for rclpy."""
 
-from __future__ import annotations
-
 import logging
 from dataclasses import replace
 from types import SimpleNamespace
@@ -14,7 +12,7 @@ import calibgraph
 from calibgraph import Calibration, Dataset, Verdict, load_dataset, load_rig
 from examples.ros2_node import Calibrator, Recording, fill_transform, matrix_of
 from tests.conftest import SAMPLE
-from tests.io.bags.writing import Messages, Stamped, sample_messages
+from tests.io.bags.writing import Messages, Stamped, require_same_frames, sample_messages
 
 MAKE = Messages("mcap")
 S = 1_000_000_000
@@ -71,11 +69,7 @@ def test_the_frames_are_those_of_the_folder(calibrator: Calibrator) -> None:
         found = data.rig.cameras[name]
         assert found.intrinsics_px == camera.intrinsics_px
         np.testing.assert_allclose(found.T_camera_lidar, camera.T_camera_lidar, atol=1e-12)
-    for one, two in zip(data.frames, folder.frames, strict=True):
-        np.testing.assert_array_equal(one.load_cloud(), two.load_cloud())
-        for name, camera in folder.rig.cameras.items():
-            pixels = (each.load_image(name, camera) for each in (one, two))
-            np.testing.assert_array_equal(*pixels)
+    require_same_frames(data, folder)
 
 
 def test_a_published_pose_has_the_lidar_as_its_parent() -> None:

@@ -9,7 +9,8 @@ from factors import (
     Lens,
     ProjectionBlock,
 )
-from tests.conftest import FORWARD, KANNALA, RADTAN5, RADTAN8
+from tests.conftest import KANNALA, RADTAN5, RADTAN8
+from tests.draws.cameras import FORWARD
 
 K = {"fx": 718.0, "fy": 710.0, "cx": 607.0, "cy": 185.0}
 

@@ -22,7 +22,8 @@ from factors import (
     unproject,
 )
 from factors.pose import custom_factor
-from tests.conftest import FORWARD, KANNALA, RADTAN5
+from tests.conftest import KANNALA, RADTAN5
+from tests.draws.cameras import FORWARD
 
 Array = np.ndarray
 Residual = Callable[[gtsam.Pose3, gtsam.Pose3], tuple[Array, Array]]

@@ -1,7 +1,5 @@
 """Rows and inputs at local paths and at URIs."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import sys

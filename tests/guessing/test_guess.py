@@ -1,7 +1,5 @@
 """A rig from words or files."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

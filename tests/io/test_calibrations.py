@@ -1,7 +1,5 @@
 """Results from disk: a file with a wrong part is refused when it is read, in one line."""
 
-from __future__ import annotations
-
 import errno
 from copy import deepcopy
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Clouds from disk: any layout is read to the last bit; what is incomplete or no cloud is named."""
 
-from __future__ import annotations
-
 import io
 import re
 import struct

@@ -1,7 +1,5 @@
 """Datasets in folders: clouds and images pair up, or the odd file is named."""
 
-from __future__ import annotations
-
 import gzip
 import os
 import re

@@ -1,11 +1,10 @@
 """Frames: images from disk, arrays in memory, what is kept of them, points moved to one instant."""
 
-from __future__ import annotations
-
 import io
 import struct
 import zlib
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -18,6 +17,7 @@ from PIL.ExifTags import Base
 import calibgraph
 from calibgraph import CalibrationError, Dataset, FileError, Rig, dataset_from_arrays, load_rig
 from calibgraph.io import dataset as kept_frames
+from calibgraph.io.bags.pictures import image_from_message
 from calibgraph.io.dataset import keep_frames
 from calibgraph.io.frame import ScanMotion, twist_between
 from calibgraph.io.images import load_image
@@ -95,11 +95,14 @@ def test_an_image_that_programs_turn_differently_is_refused(
     exif, path = Image.Exif(), tmp_path / f"turned.{suffix}"
     exif[Base.Orientation] = orientation
     Image.open(io.BytesIO(JPG)).save(path, exif=exif)
-    if orientation == 1:
-        assert load_image(path, LEFT).any()
-    else:
-        with pytest.raises(FileError, match=f"has the EXIF orientation {orientation}"):
-            load_image(path, LEFT)
+    form = {"jpg": "jpeg", "png": "png"}[suffix]
+    message = SimpleNamespace(data=np.fromfile(path, np.uint8), format=form)
+    for read in (lambda: load_image(path, LEFT), lambda: image_from_message(message, "a bag")):
+        if orientation == 1:
+            assert read().any()
+        else:
+            with pytest.raises(CalibrationError, match=f"has the EXIF orientation {orientation}"):
+                read()
 
 
 def test_profiles_in_a_png_print_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

@@ -5,8 +5,6 @@
 Prints how many were read, how many refused, and the memory [MB] that it took at most.
 """
 
-from __future__ import annotations
-
 import io
 import random
 import re

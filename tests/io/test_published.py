@@ -1,7 +1,5 @@
 """Folders of published data sets hold the frames and the rig that they were written from."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil
@@ -20,7 +18,7 @@ from calibgraph import CalibrationError, Dataset, Rig, load_dataset, load_rig
 from calibgraph.io.formats.rig_import import read_rig_parts
 from calibgraph.io.rig_parts import quaternion_xyzw
 from calibgraph.model.geometry import invert
-from tests.conftest import SAMPLE, make_camera
+from tests.conftest import SAMPLE, make_camera, require_poses
 from tests.io.written import (
     BASELINES,
     CLOUD,
@@ -351,8 +349,7 @@ def test_scenes_of_two_vehicles_are_told_apart(given: Dataset, tmp_path: Path) -
         load_rig(tmp_path)
     for scene, rig in (("scene-0002", given.rig), ("scene-0003", other.rig)):
         found = load_rig(tmp_path / scene).T_camera_lidar
-        for name, T in rig.T_camera_lidar.items():
-            np.testing.assert_allclose(found[name], T, atol=1e-12)
+        require_poses(found, rig.T_camera_lidar, atol=1e-12)
     with pytest.raises(CalibrationError, match="no such scene; the tables have scene-0001, "):
         load_rig(tmp_path / "scene-0009")
 

@@ -1,7 +1,5 @@
 """Tables from disk: what was written is read, what is wrong is named in one line."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

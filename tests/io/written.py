@@ -1,7 +1,5 @@
 """Clouds and data sets as others write them: .pcd, .ply, KITTI, nuScenes."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import struct
@@ -14,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calibgraph import Dataset
+from calibgraph.model.geometry import transform
 from tests.conftest import make_camera
 
 CLOUD = np.random.default_rng(0).normal(0, (20, 10, 1), (500, 3))
@@ -53,9 +52,8 @@ def text_of(name: str, values: np.ndarray) -> str:
     return f"{name}: " + " ".join(f"{value:.15e}" for value in np.ravel(values))
 
 
-T_EGO_LIDAR = np.eye(4)
-T_EGO_LIDAR[:3, :3] = Rotation.from_euler("z", -90, degrees=True).as_matrix()  # x to the right
-T_EGO_LIDAR[:3, 3] = 0.94, 0.0, 1.84
+R_EGO_LIDAR = Rotation.from_euler("z", -90, degrees=True)  # x to the right
+T_EGO_LIDAR = transform(R_EGO_LIDAR, [0.94, 0.0, 1.84])
 START_US, PERIOD_US = 1_532_402_927_000_000, 500_000
 Tables = dict[str, list[dict[str, Any]]]
 

@@ -1,7 +1,5 @@
 """What two cameras see in common: features, their geometry, the LiDAR's surfaces at them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -19,12 +17,13 @@ from calibgraph.matching.camera_pairs.geometry import (
     planes_at,
 )
 from calibgraph.model.camera_matches import CameraMatches
-from calibgraph.model.geometry import inverse_ranges, invert, planes_in_lidar
+from calibgraph.model.geometry import inverse_ranges, invert, planes_in_lidar, transform
 from calibgraph.simulation.rigs import rig_of
 from calibgraph.solver.pair_refinement import fit_pair
 from calibgraph.solver.pairs import pair_terms
 from factors import pose_sigmas, unproject
-from tests.conftest import FORWARD, SAMPLE, make_camera
+from tests.conftest import SAMPLE, make_camera
+from tests.draws.cameras import FORWARD
 
 
 @pytest.fixture(scope="module")
@@ -151,8 +150,7 @@ def pose_between(a: Camera, b: Camera) -> np.ndarray:
     return b.T_camera_lidar @ np.linalg.inv(a.T_camera_lidar)
 
 
-SIDEWAYS = np.eye(4)
-SIDEWAYS[0, 3] = -0.54
+SIDEWAYS = transform(np.eye(3), [-0.54, 0.0, 0.0])
 
 
 @pytest.mark.parametrize(
@@ -256,8 +254,7 @@ def test_noise_averages_out() -> None:
 
 
 def test_planes_move_between_frames_with_their_points() -> None:
-    T_camera_lidar = np.eye(4)
-    T_camera_lidar[:3, :3], T_camera_lidar[:3, 3] = FORWARD, [0.1, -0.3, 0.2]
+    T_camera_lidar = transform(FORWARD, [0.1, -0.3, 0.2])
     g = np.array([[0.1, 0.3, 0.05]])
     points = on_plane(SCAN, g[0])
     in_lidar = (invert(T_camera_lidar) @ np.column_stack([points, np.ones(len(points))]).T)[:3].T

@@ -1,7 +1,5 @@
 """Of a long recording the clear frames are matched, spread over it, and one where it stands."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Clouds of one place are alike, and frames near each other are of one place."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import replace
 from functools import cache
@@ -47,9 +45,7 @@ _RAYS = np.stack([_FLAT * np.cos(_AZIMUTH), _FLAT * np.sin(_AZIMUTH), np.sin(_EL
 
 
 def _pose(x_m: float) -> Array:
-    T_world_lidar = np.eye(4)
-    T_world_lidar[:3, 3] = x_m, 0.0, 1.8
-    return T_world_lidar
+    return transform(np.eye(3), [x_m, 0.0, 1.8])
 
 
 STOPS = [_pose(9.0 * number) for number in range(6)]
@@ -83,10 +79,8 @@ def scan_at(T_world_lidar: Array, seed: int) -> NDArray[np.float32]:
 
 def displaced(T_world_lidar: Array, *, left_m: float, turned_deg: float) -> Array:
     """(4, 4) the pose beside a stop."""
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_euler("z", turned_deg, degrees=True).as_matrix()
-    T[1, 3] = left_m
-    return T_world_lidar @ T
+    turn = Rotation.from_euler("z", turned_deg, degrees=True)
+    return T_world_lidar @ transform(turn, [0.0, left_m, 0.0])
 
 
 def cloud_at(T_world_lidar: Array, seed: int = 0) -> UprightCloud:
@@ -156,9 +150,7 @@ def test_up_is_found_in_clouds_of_other_axes_by_cameras_and_ground(axes: str) ->
 
 def driving(step_m: float) -> Motion:
     """Of a LiDAR that looks ahead: what is in front comes nearer."""
-    T = np.eye(4)
-    T[0, 3] = -step_m
-    return T
+    return transform(np.eye(3), [-step_m, 0.0, 0.0])
 
 
 def sample() -> tuple[Dataset, str]:

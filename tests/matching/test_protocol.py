@@ -1,7 +1,5 @@
 """The matcher protocol: what a matcher of your own needs, and what it may have."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -201,15 +199,3 @@ def test_a_table_matches_the_frames_of_the_dataset(
     assert set(np.unique(rows.frame)) == {1, 2}
     assert len(rows) == np.count_nonzero(np.isin(table.frame, (1, 2)))
     assert (matcher.rounds, matcher.stage1, matcher.tracking_rounds) == (1, "pnp", ())
-
-
-@pytest.mark.parametrize(
-    ("name", "words"),
-    [
-        ("cmrnext", "the matcher 'cmrnext' needs weights"),
-        ("sift", "unknown matcher 'sift'; known are 'structure', 'cmrnext' and a table"),
-    ],
-)
-def test_other_names_are_errors(name: str, words: str) -> None:
-    with pytest.raises(ValueError, match=words):
-        find_matcher(name)

@@ -12,7 +12,6 @@ from calibgraph import Rig, evaluate, perturb
 from calibgraph.model.geometry import (
     angle_deg,
     invert,
-    invert_each,
     local_coordinates,
     point_in_lidar,
     pose_difference,
@@ -101,7 +100,7 @@ def test_the_covariance_of_a_pair_follows_from_finite_differences() -> None:
 
 def test_many_rigid_transforms_are_inverted_as_any_matrix() -> None:
     T = np.array([[random_transform(seed) for seed in range(row, row + 3)] for row in range(2)])
-    np.testing.assert_allclose(invert_each(T), np.linalg.inv(T), rtol=0, atol=1e-14)
+    np.testing.assert_allclose(invert(T), np.linalg.inv(T), rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-7, 9e-3, 1.1e-2, 0.5, 1.8])

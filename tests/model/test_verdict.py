@@ -18,7 +18,6 @@ from calibgraph.model.error_sources import (
 )
 from calibgraph.model.summary import LEAST, summarize
 from calibgraph.model.verdict import (
-    Direction,
     ErrorProbability,
     Threshold,
     beside,
@@ -38,18 +37,16 @@ def test_presets_use_the_papers_numbers() -> None:
     assert not kitti.confidence_weights
 
 
-def check_of(
-    name: str, value: float, direction: Direction, *limits: float, unit: str = ""
-) -> Check:
-    return Threshold(name, name, direction, *limits, unit, "").check(value)
+def check_of(name: str, value: float, *limits: float, unit: str = "") -> Check:
+    return Threshold(name, name, *limits, unit, "").check(value)
 
 
 def test_the_worst_check_decides_and_its_reason_comes_first() -> None:
     verdict = Verdict(
         (
-            check_of("a", 2, "at most", 1, 3, unit="m"),
-            check_of("b", 0, "at most", 1, 3, unit="m"),
-            check_of("c", 0, "at least", 2, 1),
+            check_of("a", 2, 1, 3, unit="m"),
+            check_of("b", 0, 1, 3, unit="m"),
+            check_of("c", 0, 2, 1),
         )
     )
     assert verdict.status == "FAIL"
@@ -60,14 +57,14 @@ def test_the_worst_check_decides_and_its_reason_comes_first() -> None:
 def test_a_number_next_to_its_limit_is_told_from_it_in_three_digits() -> None:
     above = "above the limit 0.15 deg"
     for check, text in (
-        (check_of("x", 0.59999, "at least", 0.6, 0.3, unit="share"), "59.9%, below the limit 60%"),
-        (check_of("x", 0.1500577, "at most", 0.15, 0.5, unit="deg"), f"0.151 deg, {above}"),
-        (check_of("x", 0.2, "at most", 0.15, 0.5, unit="deg"), f"0.2 deg, {above}"),
+        (check_of("x", 0.59999, 0.6, 0.3, unit="share"), "59.9%, below the limit 60%"),
+        (check_of("x", 0.1500577, 0.15, 0.5, unit="deg"), f"0.151 deg, {above}"),
+        (check_of("x", 0.2, 0.15, 0.5, unit="deg"), f"0.2 deg, {above}"),
     ):
         assert check.text == f"x: {text}"
     assert beside(0.14999, 0.15, "deg") == "0.149 deg"
     assert beside(-0.2001, -0.2, "share") == "-20.1%"
-    assert check_of("x", 1.0, "at most", 1.0, 2.0, unit="m").status == "PASS"
+    assert check_of("x", 1.0, 1.0, 2.0, unit="m").status == "PASS"
 
 
 @pytest.mark.parametrize("seed", range(20))

@@ -1,7 +1,5 @@
 """The page in Chromium: pairs land where they are clicked, by mouse and by keys."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,10 +10,10 @@ import pytest
 
 from calibgraph import Rig, load_dataset, load_rig
 from calibgraph.pick.server import PickServer, Workspace
-from tests.chromium import CHROMIUM, axe, in_chromium, sync_api
+from tests.chromium import errors_of, require_accessible
 from tests.conftest import SAMPLE
 
-pytestmark = in_chromium
+pytestmark = pytest.mark.slow
 MARGIN_PX = 40  # of the image, at which a pair may be picked
 
 
@@ -24,9 +22,7 @@ class Picker:
 
     def __init__(self, page: Any, server: PickServer, truth: Rig) -> None:
         self.page, self.workspace, self.truth = page, server.workspace, truth
-        self.errors: list[str] = []
-        page.on("console", lambda message: self.errors.append(message.text))
-        page.on("pageerror", lambda error: self.errors.append(str(error)))
+        self.errors = errors_of(page)
         page.goto(server.url)
         page.wait_for_function("globalThis.calibgraphPick")
         self.rest()
@@ -76,14 +72,6 @@ class Picker:
             self.click("image", "imagePlace", pixel + noise_px * rng.standard_normal(2))
             self.click("cloud", "cloudPlace", point)
             self.rest()
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with sync_api.sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        yield chromium
-        chromium.close()
 
 
 @pytest.fixture
@@ -151,5 +139,4 @@ def test_the_keyboard_alone_makes_a_pair_and_the_page_is_accessible(
     picker.rest()
     (pair,) = picker.workspace.session.pairs
     assert np.linalg.norm(np.array(pair.point_lidar_m) - point) < 3
-    found = axe.Axe().run(picker.page)
-    assert found.violations_count == 0, found.generate_report()
+    require_accessible(picker.page)

@@ -1,7 +1,5 @@
 """The server of the page, what outlives it, and what pairs determine."""
 
-from __future__ import annotations
-
 import http.client
 import json
 import signal
@@ -17,13 +15,12 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 
-from calibgraph import CalibrationError, Rig, evaluate, load_dataset, load_rig
+from calibgraph import CalibrationError, Rig, load_dataset, load_rig
 from calibgraph.model.geometry import twist_between
 from calibgraph.pick.estimate import MIN_PAIRS, Pair, estimate_from_pairs, reference_rig
 from calibgraph.pick.server import PickServer, Workspace, visible_points
 from calibgraph.simulation.rigs import rig_of
-from tests.cli.conftest import error_line
-from tests.conftest import SAMPLE, Call
+from tests.conftest import SAMPLE, Call, require_near
 
 CAMERA = "front_left"
 
@@ -136,29 +133,6 @@ def test_what_was_answered_outlives_kill_9(tmp_path: Path) -> None:
     assert process.returncode in (0, 130)
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (("nothing", "--out", "session"), "no such folder"),
-        ((str(SAMPLE), "--out", "session", "--frames", "99"), "frames '99'"),
-        ((str(SAMPLE), "--out", "other"), "session of other frames or cameras"),
-        ((str(SAMPLE), "--out", "file"), "file"),
-    ],
-)
-def test_what_cannot_be_picked_is_one_line(
-    words: tuple[str, ...],
-    message: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    call: Call,
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    Workspace(load_dataset(SAMPLE, frames=":2"), tmp_path / "other").change([])
-    (tmp_path / "file").write_text("of the user")
-    assert message in error_line(*call("pick", *words, "--no-show"))
-    assert (tmp_path / "file").read_text() == "of the user"
-
-
 def draw_pairs(
     rig: Rig, camera: str, count: int, rng: np.random.Generator, noise_px: float
 ) -> list[Pair]:
@@ -184,8 +158,7 @@ def test_exact_pairs_give_the_truth_without_a_guess(name: str) -> None:
     pairs = [pair for camera in rig.cameras for pair in draw_pairs(rig, camera, 16, rng, 0.0)]
     away = rig.moved_to({name: np.eye(4) for name in rig.cameras})
     found = reference_rig(estimate_from_pairs(away, pairs))
-    for error in evaluate(found, rig).cameras.values():
-        assert error.rotation_error_deg < 1e-4 and error.translation_error_cm < 1e-3
+    require_near(found, rig, deg=1e-4, cm=1e-3)
 
 
 @pytest.mark.statistics

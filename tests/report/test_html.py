@@ -1,11 +1,10 @@
 """The page: everything of a result, nothing fetched, whatever is missing; its numbers are right."""
 
-from __future__ import annotations
-
 import html
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,8 +21,8 @@ from calibgraph.report.plots import (
     reprojection_errors,
 )
 from calibgraph.solver.robust import constrained_root
+from tests.chromium import render
 from tests.conftest import CommandRun
-from tests.report.browsing import render
 from tests.report.conftest import read_page, solve_simulated, write_page
 
 
@@ -175,11 +174,11 @@ def test_arrows_are_the_mean_of_their_cell(solved_pair: Calibration) -> None:
 
 
 def test_a_browser_shows_it_without_errors_and_without_a_network(
-    calibrated_sample: CommandRun, tmp_path: Path
+    browser: Any, calibrated_sample: CommandRun
 ) -> None:
     page = calibrated_sample.folder / "report.html"
     for width in (1280, 500):
-        rendering = render(page, tmp_path, width)
+        rendering = render(browser, page, width)
         assert rendering.errors == []
         assert rendering.requests == []
         assert rendering.picture.shape[1] == width

@@ -1,7 +1,5 @@
 """Tables for 80 columns: names fold, numbers are never cut."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,16 +1,11 @@
 """Servers in this process, and a small problem to solve."""
 
-from __future__ import annotations
-
-import io
-import json
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import pyarrow.parquet as pq
 import pytest
 from starlette.testclient import TestClient
 
@@ -19,6 +14,7 @@ from calibgraph.service.requests import Settings
 from tests.cli.conftest import save_problem
 
 URL = "http://localhost"
+ONE_EACH = ("--jobs", "1", "--tracker-processes", "1")
 
 
 @dataclass(frozen=True)
@@ -81,18 +77,3 @@ def service_folder(client: TestClient) -> Path:
     """The data folder of a server in this process."""
     app: Any = client.app
     return Path(app.state.service.folder.path)
-
-
-def frames_as_lines(table: bytes) -> list[bytes]:
-    """The frames of a table, each as a line for a tracker."""
-    rows = pq.read_table(io.BytesIO(table)).to_pylist()
-    frames: dict[int, dict[str, Any]] = {}
-    for row in rows:
-        cameras = frames.setdefault(row["frame"], {})
-        columns = cameras.setdefault(row["camera"], {})
-        for name in ("u_px", "v_px", "x_m", "y_m", "z_m"):
-            columns.setdefault(name, []).append(row[name])
-    return [
-        json.dumps({"frame": frame, "cameras": cameras}).encode() + b"\n"
-        for frame, cameras in sorted(frames.items())
-    ]

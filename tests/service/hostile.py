@@ -1,7 +1,5 @@
 """Uploads that want to harm: bombs, paths, lies about sizes, broken files."""
 
-from __future__ import annotations
-
 import io
 import json
 import pickle

@@ -1,7 +1,5 @@
 """Who may call what: tokens, names of the server, pages of other sites, headers."""
 
-from __future__ import annotations
-
 import base64
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Faults: a full disk, a broken database, a clock that jumps, a client that goes, a dead worker."""
 
-from __future__ import annotations
-
 import errno
 import sqlite3
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Uploads: archives as people make them, and hostile ones, which leave one line and no file."""
 
-from __future__ import annotations
-
 import os
 import time
 from pathlib import Path

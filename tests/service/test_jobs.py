@@ -1,20 +1,17 @@
 """Jobs over HTTP: taken in, run, followed, cancelled; what a result gives."""
 
-from __future__ import annotations
-
 import io
 import zipfile
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
 from calibgraph import load_rig, solve
 from calibgraph.service.app import create_app
 from calibgraph.service.requests import Settings
-from tests.conftest import SAMPLE, CommandRun
+from tests.conftest import SAMPLE, CommandRun, require_poses
 from tests.service.conftest import URL, Make, Problem, service_folder
 from tests.service.hostile import zipped
 
@@ -23,6 +20,10 @@ SOLVE = "/v1/jobs/solve"
 
 def submit(client: TestClient, small: Problem, **data: str) -> Any:
     return client.post(SOLVE, files=small.files, data=data)
+
+
+def poses_of(result: Any) -> dict[str, Any]:
+    return {name: camera["T_camera_lidar"] for name, camera in result["cameras"].items()}
 
 
 def text(value: str) -> tuple[None, str]:
@@ -74,9 +75,7 @@ def test_a_result_is_that_of_the_library(
     found = working.get(f"/v1/jobs/{solved}/result").json()
     assert found["verdict"] == expected.verdict.status
     assert working.get(f"/v1/jobs/{solved}").json()["cannot_tell"] is False
-    for name, camera in expected.rig.cameras.items():
-        T = np.array(found["cameras"][name]["T_camera_lidar"])
-        np.testing.assert_allclose(T, camera.T_camera_lidar, rtol=0, atol=1e-12)
+    require_poses(poses_of(found), expected.rig.T_camera_lidar, atol=1e-12)
 
 
 def test_a_result_has_files_and_a_sandboxed_report(working: TestClient, solved: str) -> None:
@@ -172,6 +171,4 @@ def test_a_recording_is_calibrated_as_by_the_command(
             break
     result = working.get(f"{at}/result").json()
     expected = load_rig(calibrated_sample.folder / "calibration.yaml")
-    for name, camera in expected.cameras.items():
-        T = np.array(result["cameras"][name]["T_camera_lidar"])
-        np.testing.assert_allclose(T, camera.T_camera_lidar, rtol=0, atol=1e-9)
+    require_poses(poses_of(result), expected.T_camera_lidar, atol=1e-9)

@@ -1,19 +1,16 @@
 """The page in Chromium: nothing in its console, contrast, a phone's width, the token."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
 
 from calibgraph.service.request_guard import add_token
-from tests.chromium import CHROMIUM, axe, in_chromium, sync_api
-from tests.service.conftest import Problem, bearer
-from tests.service.test_server import Server
+from tests.chromium import errors_of, require_accessible
+from tests.service.conftest import ONE_EACH, Problem, bearer
+from tests.service.serving import Server
 
-pytestmark = in_chromium
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
@@ -21,7 +18,7 @@ def served(tmp_path_factory: pytest.TempPathFactory, small: Problem) -> Iterator
     """A server with jobs of all states, and a token of it."""
     folder = tmp_path_factory.mktemp("page")
     token = add_token(folder / "tokens")
-    server = Server(folder / "data", "--tokens", str(folder / "tokens"))
+    server = Server(folder / "data", *ONE_EACH, "--tokens", str(folder / "tokens"))
     server.start()
     server.http.headers.update(bearer(token))
     about = {"name": "car 7 <b>"}
@@ -36,28 +33,20 @@ def served(tmp_path_factory: pytest.TempPathFactory, small: Problem) -> Iterator
 
 @pytest.mark.parametrize("size", [(390, 844), (1280, 900)], ids=["phone", "desk"])
 def test_the_page_is_clean_readable_and_leads_to_reports(
-    served: tuple[str, str], size: tuple[int, int], tmp_path: Path
+    browser: Any, served: tuple[str, str], size: tuple[int, int]
 ) -> None:
     url, token = served
-    with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        page: Any = browser.new_page(
-            viewport={"width": size[0], "height": size[1]},
-            http_credentials={"username": "", "password": token},
-        )
-        errors: list[str] = []
-        page.on("console", lambda message: errors.append(message.text))
-        page.on("pageerror", lambda error: errors.append(str(error)))
-        page.on("requestfailed", lambda request: errors.append(request.url))
-        page.goto(url, wait_until="networkidle")
-        page.screenshot(path=tmp_path / f"jobs_{size[0]}.png", full_page=True)
-        assert page.locator("text=car 7 <b>").count() == 1
-        assert page.locator(".badge.PASS").count() == 2
-        for _ in range(2):
-            found = axe.Axe().run(page, options={"resultTypes": ["violations"]})
-            assert found.violations_count == 0, found.generate_report()
-            assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
-            page.click("text=Report >> nth=0") if page.url.endswith("/") else None
-        assert page.url.endswith("/report.html")
-        assert errors == []
-        browser.close()
+    page = browser.new_page(
+        viewport={"width": size[0], "height": size[1]},
+        http_credentials={"username": "", "password": token},
+    )
+    errors = errors_of(page)
+    page.goto(url, wait_until="networkidle")
+    assert page.locator("text=car 7 <b>").count() == 1
+    assert page.locator(".badge.PASS").count() == 2
+    for _ in range(2):
+        require_accessible(page)
+        assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
+        page.click("text=Report >> nth=0") if page.url.endswith("/") else None
+    assert page.url.endswith("/report.html")
+    assert errors == []

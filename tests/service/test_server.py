@@ -1,82 +1,28 @@
 """The server as a process: connections that want to harm, kill -9, SIGTERM, a full disk."""
 
-from __future__ import annotations
-
 import os
 import signal
 import socket
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
-import httpx
 import psutil
 import pytest
 
-from tests.service.conftest import Problem, frames_as_lines
+from tests.service.conftest import ONE_EACH, Problem
+from tests.service.serving import SHORT, Server, frames_as_lines
 
 HALF_REQUESTS = (
     b"GET /healthz HTTP/1.1\r\nHost: localhost\r\nX: ",
     b"POST /v1/trackers/a HTTP/1.1\r\nHost: localhost\r\nContent-Length: 100000\r\n\r\nab",
 )
-SHORT = (
-    "from calibgraph.service import app, request_guard;"
-    "request_guard.BODY_S = app.IDLE_S = 2.0;"
-    "from calibgraph.cli.app import main; main()"
-)
-"""The command with shorter waits."""
-
-
-class Server:
-    """``calibgraph serve`` as a process of its own, on a port that stays."""
-
-    def __init__(self, data: Path, *options: str) -> None:
-        with socket.create_server(("127.0.0.1", 0)) as free:
-            self.port = free.getsockname()[1]
-        self._words = ["serve", "--data", str(data), "--port", str(self.port), "--free-gb", "0",
-                       "--jobs", "1", "--tracker-processes", "1", *options]  # fmt: skip
-        self._log = data.with_suffix(".log")
-        self.http = httpx.Client(base_url=f"http://127.0.0.1:{self.port}", timeout=120)
-
-    def start(self) -> None:
-        command = [sys.executable, "-c", SHORT, *self._words]
-        with self._log.open("ab") as log:
-            self.process = psutil.Popen(command, stdout=log, stderr=log, stdin=subprocess.DEVNULL)
-        end = time.monotonic() + 120
-        while time.monotonic() < end:
-            with suppress(httpx.HTTPError):
-                if self.http.get("/healthz").status_code == 200:
-                    return
-            time.sleep(0.1)
-        raise AssertionError(self._log.read_text())
-
-    def end(self, number: int) -> None:
-        self.process.send_signal(number)
-        self.process.wait(60)
-
-    def connect(self) -> socket.socket:
-        connection = socket.create_connection(("127.0.0.1", self.port))
-        connection.settimeout(60)
-        return connection
-
-    def memory_mb(self) -> float:
-        return float(self.process.memory_info().rss / 1e6)
-
-    def wait_for(self, at: str) -> dict[str, object]:
-        """A job when it is finished."""
-        for _ in range(10):
-            job: dict[str, object] = self.http.get(at, params={"wait_s": 60}).json()
-            if job["finished"]:
-                break
-        return job
 
 
 @pytest.fixture
 def server(tmp_path: Path) -> Iterator[Server]:
-    found = Server(tmp_path / "data")
+    found = Server(tmp_path / "data", *ONE_EACH, program=("-c", SHORT))
     found.start()
     yield found
     found.http.close()

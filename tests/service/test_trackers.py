@@ -1,7 +1,5 @@
 """Trackers over HTTP: frames once, as `track` prints them, on disk when acknowledged."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -11,7 +9,8 @@ import pyarrow.parquet as pq
 import pytest
 from starlette.testclient import TestClient
 
-from tests.service.conftest import Problem, frames_as_lines, service_folder
+from tests.service.conftest import Problem, service_folder
+from tests.service.serving import frames_as_lines
 
 
 @pytest.fixture

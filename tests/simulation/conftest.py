@@ -1,17 +1,15 @@
 """A short drive, a small camera and a coarse LiDAR, shared by the tests of the sensors."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from calibgraph import Camera, Intrinsics, Rig
 from calibgraph.simulation.lidar import lidar_of
 from calibgraph.simulation.recording import Drive, build_drive, simulate_street
-from tests.conftest import FORWARD, KANNALA, RADTAN5
+from tests.conftest import KANNALA, RADTAN5
+from tests.draws.cameras import camera_at
 
 LENSES: dict[str, tuple[float, ...]] = {
     "pinhole": (),
@@ -28,18 +26,10 @@ SCAN = replace(lidar_of(16), azimuth_step_deg=1.0)
 
 
 def small_camera(lens: str, position_m: tuple[float, float, float] = (0.3, 0.2, -0.3)) -> Camera:
-    T = np.eye(4)
-    T[:3, :3] = FORWARD
-    T[:3, 3] = -FORWARD @ position_m
     focal = FOCAL_PX.get(lens, 62.0)  # 120 px from the centre: 39 degrees, fisheye 107
-    return Camera(
-        model="pinhole" if lens == "radtan" else lens,
-        width_px=240,
-        height_px=150,
-        intrinsics_px=Intrinsics(fx=focal, fy=focal + 1, cx=121.3, cy=73.8),
-        distortion=LENSES[lens],
-        T_camera_lidar=T,
-    )
+    intrinsics = Intrinsics(fx=focal, fy=focal + 1, cx=121.3, cy=73.8)
+    model = "pinhole" if lens == "radtan" else lens
+    return camera_at((240, 150), intrinsics, position_m, model=model, distortion=LENSES[lens])
 
 
 @pytest.fixture(scope="session")

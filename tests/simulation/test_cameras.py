@@ -1,7 +1,5 @@
 """Simulated cameras: the inverse of every lens, and the images."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Simulated correspondences: errors as configured; rigs that see all round are calibrated."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +10,7 @@ from calibgraph import Correspondences, MatcherErrors, Rig, simulate_corresponde
 from calibgraph.simulation.correspondences import PoseSpread
 from calibgraph.simulation.rigs import RIG_NAMES, rig_of
 from calibgraph.solver.joint import solve_joint
+from tests.conftest import require_near
 
 
 def residuals(rig: Rig, table: Correspondences, name: str) -> np.ndarray:
@@ -90,10 +89,8 @@ def test_a_table_of_a_rig_that_sees_all_round_is_solved() -> None:
         calibgraph.perturb(rig, rotation_deg=5, translation_m=0.3, seed=1), table
     )
     assert result.verdict.status == "PASS"
-    for error in calibgraph.evaluate(result.rig, rig).cameras.values():
-        # 1 px of 300 px/rad over 2000 matches: 0.2 deg / 45, and as much of 10 m.
-        assert error.rotation_error_deg < 0.03
-        assert error.translation_error_cm < 1.0
+    # 1 px of 300 px/rad over 2000 matches: 0.2 deg / 45, and as much of 10 m.
+    require_near(result.rig, rig, deg=0.03, cm=1.0)
 
 
 @pytest.mark.slow
@@ -107,6 +104,4 @@ def test_a_rendered_rig_that_sees_all_round_is_calibrated(name: str, tmp_path: P
     result = calibgraph.calibrate(tmp_path / "street")
     assert result.verdict.status == "PASS"
     truth = calibgraph.load_rig(tmp_path / "street" / "reference.yaml")
-    for error in calibgraph.evaluate(result.rig, truth).cameras.values():
-        assert error.rotation_error_deg < 0.06
-        assert error.translation_error_cm < 1.5
+    require_near(result.rig, truth, deg=0.06, cm=1.5)

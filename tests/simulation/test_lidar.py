@@ -1,7 +1,5 @@
 """The simulated LiDAR: ranges, dropouts, intensities, and its errors."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -21,7 +21,7 @@ from calibgraph.model.error_sources import MOTION
 from calibgraph.model.geometry import twist_between
 from calibgraph.model.verdict import TOLERANCE
 from calibgraph.solver.joint import solve_joint
-from calibgraph.trust.evidence import gather
+from calibgraph.trust.evidence import Evidence
 from calibgraph.trust.lens_checks import intrinsics_checks
 from factors import Clock, displace
 from tests.draws.clocks import draw_twists, put_clock_error
@@ -56,8 +56,8 @@ def test_what_an_unknown_motion_does_to_a_sweep_is_in_the_bar(
     truth, table = simulated(0, frames=10, matches=100)
     late_s = np.where(table.camera_index == 0, 0.03 + 2e-5 * (table.pixels_px[:, 0] - 600), -0.01)
     swept = displace(table.points_lidar_m, twist, -late_s)
-    still = gather(solve_joint(truth, replace(table, late_s=np.zeros(len(table)))), truth)
-    found = gather(solve_joint(truth, replace(table, points_lidar_m=swept, late_s=late_s)), truth)
+    still = Evidence(solve_joint(truth, replace(table, late_s=np.zeros(len(table)))), truth)
+    found = Evidence(solve_joint(truth, replace(table, points_lidar_m=swept, late_s=late_s)), truth)
     assert not still.solution.travel.any()
     assert intrinsics_checks(still) and not intrinsics_checks(found)  # a sweep looks like a lens
     moved = np.concatenate([

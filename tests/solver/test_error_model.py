@@ -41,7 +41,7 @@ from calibgraph.solver.places import ErrorFit
 from calibgraph.solver.robust import ResidualScale
 from calibgraph.solver.sources import variances_by_source
 from calibgraph.solver.within_place import block_by_place
-from calibgraph.trust.evidence import Evidence, gather
+from calibgraph.trust.evidence import Evidence
 from factors import pose_sigmas
 from tests.draws.lenses import with_known_lenses
 from tests.draws.places import displaced
@@ -143,7 +143,7 @@ def table_of_places(rig: Rig, places: int, stated: dict[str, Any]) -> Correspond
 
 
 def evidence(rig: Rig, found: Correspondences, config: Config | None = None) -> Evidence:
-    return gather(solve_joint(rig, found, config or Config()), rig)
+    return Evidence(solve_joint(rig, found, config or Config()), rig)
 
 
 @pytest.mark.parametrize("config", [Config(), preset("kitti")])
@@ -275,7 +275,7 @@ def test_a_displaced_camera_widens_the_error_bars(pair: Rig) -> None:
     for points in (table.points_lidar_m, moved):
         given = replace(table, points_lidar_m=points, metadata=metadata)
         solution = solve_joint(pair, given, camera_matches=simulated_pairs(pair))
-        evidence = gather(solution, pair)
+        evidence = Evidence(solution, pair)
         covariance = evidence.covariance_of("right")
         widths.append(float(np.sqrt(covariance[3, 3])))
         errors = [

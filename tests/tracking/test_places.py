@@ -29,7 +29,7 @@ from calibgraph.model.geometry import (
 from calibgraph.solver.joint import solve_joint
 from calibgraph.tracking import DurableCalibrator, IncrementalCalibrator
 from calibgraph.tracking.estimate import Terms, every_place
-from calibgraph.trust.evidence import gather
+from calibgraph.trust.evidence import Evidence
 from tests.conftest import stereo_relative_pose
 from tests.draws.places import Drawn, draw_places, tied
 from tests.tracking.drives import drive, pair_of, track_draw
@@ -49,7 +49,7 @@ STATED = {
 
 def batch_of(drawn: Drawn, **config: object) -> tuple[dict[str, Array], Array]:
     solved = solve_joint(drawn.rig, drawn.table, Config(learnt_weights=False, **config))
-    joint = gather(solved, drawn.rig).joint_covariance
+    joint = Evidence(solved, drawn.rig).joint_covariance
     return solved.T_camera_lidar, joint
 
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import gtsam
 import numpy as np
@@ -26,8 +24,8 @@ from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.solver.joint import solve_joint
 from calibgraph.solver.pair_refinement import fit_pairs, place_pairs
 from calibgraph.solver.pairs import pair_terms
-from calibgraph.trust.agreement import PairAgreement, check_agreement, pair_agreement
-from calibgraph.trust.evidence import gather
+from calibgraph.trust.agreement import Apart, check_agreement, pair_agreement
+from calibgraph.trust.evidence import Evidence
 from factors import pose_sigmas
 from tests.conftest import stereo_relative_pose
 from tests.draws.lenses import with_known_lenses
@@ -92,7 +90,7 @@ def test_an_error_shared_by_all_frames_moves_a_camera_without_correspondences_wi
     table = simulated(pair, frames=10).of_camera("left")
     findings = table.metadata | {"systematic_rotation_rad": 0.01, "systematic_translation_m": 0.1}
     table = table.with_metadata(findings)
-    covariance = gather(solve_joint(rig, table), rig).joint_covariance
+    covariance = Evidence(solve_joint(rig, table), rig).joint_covariance
     sigmas = np.sqrt(np.diag(covariance)).reshape(-1, 6)
     assert sigmas[1, :3] == pytest.approx([0.01] * 3, rel=0.05)  # not more: the pair is rigid
     assert sigmas[1, 3:] == pytest.approx([0.1] * 3, rel=0.05)
@@ -106,20 +104,14 @@ def test_a_relative_pose_ties_cameras_unless_matches_contradict_it(
     turn = gtsam.Pose3(gtsam.Rot3.Ry(np.radians(turned_deg)), np.zeros(3)).matrix()
     measured = measured.model_copy(update={"T_a_b": measured.T_a_b @ turn})
     rig = pair.model_copy(update={"relative_poses": (measured,)})
-    seen: list[Sequence[Sequence[str]]] = []
-
-    def measure(covariances: Mapping[str, Array], found: Sequence[Sequence[str]]) -> dict[str, Any]:
-        seen.append(found)
-        return {}
-
-    assert not gather(solve_joint(rig, simulated(rig, frames=10)), rig, measure).posteriors
-    assert seen == [groups or [("left",), ("right",)]]
+    found = Evidence(solve_joint(rig, simulated(rig, frames=10)), rig).tied
+    assert found == (groups or [("left",), ("right",)])
 
 
 SIGMAS = pose_sigmas(rotation_rad=np.radians(0.05), translation_m=0.01)
 
 
-def agreement(rig: Rig, table: CameraMatches) -> PairAgreement:
+def agreement(rig: Rig, table: CameraMatches) -> Apart:
     terms, held = pair_terms(rig, table), np.array([np.diag(SIGMAS**2)] * 2)
     T = rig.T_camera_lidar
     (fit,) = fit_pairs(terms, T, held, place_pairs(terms, T))
@@ -137,26 +129,26 @@ def test_a_right_calibration_agrees(pair: Rig) -> None:
             name: gtsam.Pose3.Expmap(twist).matrix() @ T
             for twist, (name, T) in zip(twists, pair.T_camera_lidar.items(), strict=True)
         }
-        found = agreement(pair.moved_to(moved), table)
-        sigmas.append(found.sigmas)
-        assert found.degrees < 0.4 and found.centimetres < 6
+        degrees, centimetres, largest = agreement(pair.moved_to(moved), table)
+        sigmas.append(largest)
+        assert degrees < 0.4 and centimetres < 6
     # The largest of six standard Gaussians is 0.5 to 3 in 99 of 100 draws.
     assert 0.5 < np.median(sigmas) < 2.2 and max(sigmas) < 3.5
 
 
 def test_a_moved_camera_disagrees_by_its_motion(pair: Rig) -> None:
     moved = perturb(pair, rotation_deg=0.5, translation_m=0.1, seed=4).T_camera_lidar["right"]
-    found = agreement(pair.moved_to({"right": moved}), simulated_pairs(pair))
-    assert found.degrees == pytest.approx(0.5, abs=0.1)
-    assert found.sigmas > 4
+    degrees, _, sigmas = agreement(pair.moved_to({"right": moved}), simulated_pairs(pair))
+    assert degrees == pytest.approx(0.5, abs=0.1)
+    assert sigmas > 4
 
 
 def test_swapped_images_disagree_by_twice_the_baseline(pair: Rig) -> None:
     table = simulated_pairs(pair)
     swapped = replace(table, pixels_px=np.ascontiguousarray(table.pixels_px[:, ::-1]))
-    found = agreement(pair, swapped)
-    assert found.centimetres == pytest.approx(100, abs=10)
-    assert found.sigmas > 10
+    _, centimetres, sigmas = agreement(pair, swapped)
+    assert centimetres == pytest.approx(100, abs=10)
+    assert sigmas > 10
 
 
 def judged(truth: Rig, seen: Rig, matches: CameraMatches | None) -> Calibration:
@@ -179,25 +171,21 @@ def test_the_verdict_names_a_pair_whose_images_disagree(pair: Rig) -> None:
         assert "contradict each other on the pose of left to right" in failed.text
 
 
-def disagreement(a: str, b: str, sigmas: float) -> PairAgreement:
-    return PairAgreement(a, b, 0.3, 10.0, sigmas)
-
-
 def test_a_camera_that_disagrees_with_all_its_neighbours_is_the_one_that_is_wrong() -> None:
-    found = [disagreement("a", "b", 4.2), disagreement("b", "c", 3.8), disagreement("c", "d", 0.5)]
-    blamed, spared = (check_agreement(found[0], name, found) for name in ("b", "a"))
+    apart = {("a", "b"): (0.3, 10.0, 4.2), ("b", "c"): (0.3, 10.0, 3.8), ("c", "d"): (0, 0, 0.5)}
+    blamed, spared = (check_agreement(("a", "b"), name, apart) for name in ("b", "a"))
     assert blamed.status == "FAIL" and blamed.severity > 2
     assert spared.status == "WARN" and spared.severity == 1.0  # never PASS: nobody vouches for it
     assert "by its other pairs (3.8 sigma) it is b that is wrong" in spared.text
-    assert check_agreement(found[1], "c", found).severity == 1.0
-    assert check_agreement(found[2], "d", found).status == "PASS"
+    assert check_agreement(("b", "c"), "c", apart).severity == 1.0
+    assert check_agreement(("c", "d"), "d", apart).status == "PASS"
 
 
 def test_of_two_cameras_either_may_be_wrong() -> None:
-    found = [disagreement("a", "b", 4.2)]
-    assert [check_agreement(found[0], name, found).status for name in "ab"] == ["FAIL", "FAIL"]
-    nearly = [*found, disagreement("b", "c", 1.5)]  # a neighbour of b agrees
-    assert check_agreement(nearly[0], "a", nearly).status == "FAIL"
+    pair, apart = ("a", "b"), {("a", "b"): (0.3, 10.0, 4.2)}
+    assert [check_agreement(pair, name, apart).status for name in pair] == ["FAIL", "FAIL"]
+    nearly = {**apart, ("b", "c"): (0.3, 10.0, 1.5)}  # a neighbour of b agrees
+    assert check_agreement(pair, "a", nearly).status == "FAIL"
 
 
 @pytest.mark.parametrize(("tied", "metres"), [(False, 0.0), (False, 0.02), (True, 0.0)])

@@ -23,7 +23,7 @@ from calibgraph.trust.conventions import (
     likely_intended_guess,
     undo_convention_errors,
 )
-from calibgraph.trust.evidence import gather
+from calibgraph.trust.evidence import Evidence
 from calibgraph.trust.guess import (
     compare_with_other_guesses,
     describe_other_frame,
@@ -101,7 +101,7 @@ def test_an_inverted_guess_is_named_though_the_result_is_right(pair: Rig) -> Non
 
 def test_a_near_guess_passes(pair: Rig) -> None:
     guess = calibgraph.perturb(pair, rotation_deg=10, translation_m=1, seed=1)
-    evidence = gather(solve_joint(pair, simulated(pair)), guess)
+    evidence = Evidence(solve_joint(pair, simulated(pair)), guess)
     for checks in guess_checks(evidence).values():
         assert [check.status for check in checks] == ["PASS"]
 

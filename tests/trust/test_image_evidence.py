@@ -19,10 +19,9 @@ from calibgraph.pipeline import to_calibration
 from calibgraph.solver.joint import solve_joint
 from calibgraph.trust import image_evidence
 from calibgraph.trust.assess import assess
-from calibgraph.trust.evidence import gather
+from calibgraph.trust.evidence import Evidence
 from calibgraph.trust.image_evidence import (
     ImageEvidence,
-    check_images,
     evidence_checks,
     frames_check,
     measure_image_evidence,
@@ -38,12 +37,6 @@ from tests.trust.conftest import simulated
 NAME = "front_left"
 
 NAMES = {n: f"{n:06}" for n in range(6)}
-EMPTY = Correspondences.from_arrays(
-    camera=NAME,
-    frame=np.empty(0, np.int64),
-    pixels_px=np.empty((0, 2)),
-    points_lidar_m=np.empty((0, 3)),
-)
 
 
 @pytest.fixture
@@ -129,9 +122,9 @@ def test_a_camera_without_structure_gets_a_warning(
     points = np.random.default_rng(0).uniform(5, 6, (10, 4)).astype(np.float32)
     np.save(tmp_path / "few.npy", points)
     frames = tuple(replace(frame, cloud_path=tmp_path / "few.npy") for frame in dataset.frames)
-    checks = check_images(replace(dataset, frames=frames), truth, EMPTY)[NAME]
-    assert [check.status for check in checks] == ["WARN"]
-    assert "structure in both image and cloud" in checks[0].text
+    found = measure_image_evidence(replace(dataset, frames=frames), truth)[NAME]
+    (check,) = evidence_checks(found, NAMES)
+    assert check.status == "WARN" and "structure in both image and cloud" in check.text
 
 
 CLOUD = load_cloud(SAMPLE / "lidar" / "000000.npy")
@@ -192,7 +185,7 @@ def left_by_run(pair: Rig) -> Run:
     """The result of a run that saw flat evidence of one camera, and a fault; and its table."""
     solution = solve_joint(pair, simulated(pair, frames=20))
     posterior = PosePosterior(0.1 * FLAT, FLAT, 0.3)
-    evidence = gather(solution, pair, lambda *_: {CAMERA: posterior})
+    evidence = Evidence(solution, pair, {CAMERA: posterior})
     checks = RunChecks(assess(evidence), {CAMERA: [FAILED]}, {CAMERA: [CAUSE]})
     table = solution.correspondences
     seen = table.with_metadata({**table.metadata, **to_metadata(evidence, checks)})

@@ -13,7 +13,7 @@ from calibgraph.trust.lens_parameter import (
     advise_together,
     check_parameter,
 )
-from calibgraph.trust.thresholds import limit
+from calibgraph.trust.thresholds import LENS_WRONG, LENS_WRONG_SHARE
 
 
 def estimate(name: str, size: float, sigma: float, moved_cm: float) -> LensParameter:
@@ -51,7 +51,7 @@ def test_the_other_parameter_is_usual_or_wrong(other: float) -> None:
     fit = freed(other, 10.0, covariance=covariance.tolist())
     found = LensParameter.of("distortion", [0.002], fit)
 
-    share, wrong, grid = limit("lens_wrong_share"), limit("lens_wrong"), np.linspace(-90, 90, 1801)
+    share, wrong, grid = LENS_WRONG_SHARE, LENS_WRONG, np.linspace(-90, 90, 1801)
     steps = np.stack(np.meshgrid(grid - other, grid - 10.0, indexing="ij"), axis=-1)
     fits = np.exp(-np.einsum("xyi,ij,xyj->xy", steps, np.linalg.inv(covariance), steps) / 2)
     prior = (1 - share) * np.exp(-(grid**2) / 2)

@@ -17,7 +17,7 @@ from calibgraph.model.metrics import perturb
 from calibgraph.pipeline import to_calibration
 from calibgraph.solver.joint import solve_joint
 from calibgraph.trust.assess import assess
-from calibgraph.trust.evidence import gather
+from calibgraph.trust.evidence import Evidence
 from calibgraph.trust.image_record import RunChecks
 from calibgraph.trust.pose_posterior import (
     REACH,
@@ -120,8 +120,8 @@ def test_no_direction_is_narrower_than_by_the_matches_or_by_the_images() -> None
 
 def test_flat_evidence_widens_the_error_bar_and_is_named_as_its_source(pair: Rig) -> None:
     solution = solve_joint(pair, simulated(pair, frames=20))
-    plain = gather(solution, pair)
-    flat = gather(solution, pair, lambda *_: {"left": certain(WIDE)})
+    plain = Evidence(solution, pair)
+    flat = Evidence(solution, pair, {"left": certain(WIDE)})
     narrow, wide = (np.sqrt(np.diag(each.covariance_of("left"))) for each in (plain, flat))
     assert (wide > 3 * narrow).all()
     sources = flat.error_sources["left"]
@@ -137,7 +137,7 @@ def test_no_deployed_pose_is_wrong_that_the_images_alone_allow(pair: Rig) -> Non
     solution = solve_joint(pair, simulated(pair, frames=20))
     for elsewhere, status in ((WIDE, "CANNOT TELL"), (1e-3 * WIDE, "WRONG")):
         found = replace(certain(1e-3 * WIDE), elsewhere=certain(elsewhere).near)
-        evidence = gather(solution, deployed, lambda *_, found=found: {"left": found})
+        evidence = Evidence(solution, deployed, {"left": found})
         audit = judge_camera(evidence, "left", "", tolerance_twist(0.5, 10.0))
         assert audit.status == status
         assert audit.sigma is not None and np.degrees(audit.sigma[:3].max()) < 0.1
@@ -152,8 +152,8 @@ def test_a_wider_surface_is_doubt_of_the_error_bar_alone_and_no_check_fails(
 ) -> None:
     """The check states how much wider; the verdict is the one without it."""
     solution = solve_joint(pair, simulated(pair, frames=20))
-    covariance = gather(solution, pair).covariance_of("left")
-    evidence = gather(solution, pair, lambda *_: {"left": certain(wider**2 * covariance)})
+    covariance = Evidence(solution, pair).covariance_of("left")
+    evidence = Evidence(solution, pair, {"left": certain(wider**2 * covariance)})
     found = to_calibration(
         evidence, RunChecks(assess(evidence), unseen=evidence.cameras)
     ).camera_verdicts["left"]

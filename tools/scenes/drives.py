@@ -1,8 +1,7 @@
 """The rig of simulated drives, how it moves, and the picture of one such drive."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import gtsam
@@ -11,7 +10,6 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from calibgraph import (
-    Camera,
     IncrementalCalibrator,
     Intrinsics,
     MatcherErrors,
@@ -21,29 +19,22 @@ from calibgraph import (
 )
 from calibgraph.model.geometry import invert
 from factors.pose_kernel import logarithms
+from tests.draws.cameras import camera_at
 from tests.draws.drives import simulate_drive
 from tests.draws.lenses import with_known_lenses
 
-FORWARD = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 ERRORS = MatcherErrors(noise_px=1.0, frame_noise_px=0.5, outlier_share=0.1)
 MATCHES = 200
 
 
-def camera(position_m: tuple[float, float, float], yaw_deg: float) -> Camera:
-    """A camera of KITTI's size."""
-    turn = gtsam.Rot3.Yaw(-np.radians(yaw_deg)).matrix()
-    T = np.eye(4)
-    T[:3, :3] = FORWARD @ turn
-    T[:3, 3] = -T[:3, :3] @ np.array(position_m)
-    intrinsics = Intrinsics(fx=718.0, fy=710.0, cx=607.0, cy=185.0)
-    return Camera(width_px=1240, height_px=376, intrinsics_px=intrinsics, T_camera_lidar=T)
-
+camera = partial(camera_at, (1240, 376), Intrinsics(fx=718.0, fy=710.0, cx=607.0, cy=185.0))
+"""A camera of KITTI's size."""
 
 RIG = with_known_lenses(
     Rig(
         cameras={
-            "left": camera((0.3, 0.1, -0.1), 0),
-            "right": camera((0.3, -0.4, -0.1), 0),
+            "left": camera((0.3, 0.1, -0.1)),
+            "right": camera((0.3, -0.4, -0.1)),
             "side": camera((0.0, 0.4, -0.1), 80),
         }
     )

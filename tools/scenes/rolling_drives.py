@@ -1,7 +1,5 @@
 """Rendered drives of a camera whose lens and clock are wrong: rows are taken in turn, and late."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path

@@ -5,8 +5,6 @@ beam met. The alignment of a camera is the pose that brings the delivered points
 to these pixels, all of equal weight.
 """
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -21,37 +19,25 @@ from calibgraph.model.geometry import to_T_camera_lidar, to_T_lidar_camera, twis
 from calibgraph.simulation.lidar import lidar_of
 from calibgraph.simulation.rigs import rig_of
 from factors import ProjectionBlock, block_factor
+from tests.draws.cameras import camera_at
 from tools.scenes.scan_errors import ScanErrors
 
 ALIGNMENT = "alignment.yaml"
 _MOST = 20_000  # points of a camera
-FORWARD = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 
 
 def pair() -> Rig:
     """KITTI's stereo pair, of half the size."""
     lens = Intrinsics(fx=359.4, fy=359.4, cx=303.6, cy=92.6)
     places = {"left": (0.27, 0.06, -0.08), "right": (0.27, -0.48, -0.08)}
-    return Rig(cameras={n: camera_at(620, 188, lens, xyz, 0.9) for n, xyz in places.items()})
+    return Rig(cameras={n: camera_at((620, 188), lens, xyz, 0.9) for n, xyz in places.items()})
 
 
 def wide() -> Rig:
     """Two cameras of 93 degrees, half to the left and half to the right."""
     lens = Intrinsics(fx=303.0, fy=303.0, cx=319.5, cy=199.5)
     views = {"left": ((0.3, 0.2, -0.2), 35.0), "right": ((0.3, -0.2, -0.2), -35.0)}
-    return Rig(cameras={n: camera_at(640, 400, lens, *view) for n, view in views.items()})
-
-
-def camera_at(
-    width: int, height: int, lens: Intrinsics, xyz_m: tuple[float, ...], yaw_deg: float
-) -> Camera:
-    """A level camera at a place in the LiDAR's frame, turned to the left."""
-    turn, (sine, cosine) = np.eye(3), (np.sin(np.radians(yaw_deg)), np.cos(np.radians(yaw_deg)))
-    turn[:2, :2] = [[cosine, sine], [-sine, cosine]]
-    T = np.eye(4)
-    T[:3, :3] = FORWARD @ turn
-    T[:3, 3] = -T[:3, :3] @ xyz_m
-    return Camera(width_px=width, height_px=height, intrinsics_px=lens, T_camera_lidar=T)
+    return Rig(cameras={n: camera_at((640, 400), lens, *view) for n, view in views.items()})
 
 
 RIGS = (("pair", pair, 64), ("sample", partial(rig_of, "sample"), 64),

@@ -1,7 +1,5 @@
 """Images spoilt pixel by pixel: by night, sun, rain, dirt, a shutter, a lens or a lorry."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

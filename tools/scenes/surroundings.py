@@ -4,8 +4,6 @@ Few of them have the walls, corners and poles that a calibration lives on. Frame
 :mod:`calibgraph.simulation.street`; the lane at ``LANE_Y_M`` is free in all of them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from calibgraph import (
     Calibration,
@@ -20,11 +19,10 @@ from calibgraph import (
     concatenate,
     perturb,
 )
+from tests.draws.cameras import camera_at
 from tests.draws.drives import simulate_drive
 
 Rng = np.random.Generator
-
-FORWARD = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,21 +134,11 @@ def rigs() -> dict[str, Rig]:
 
 
 def _camera(
-    position_m: Sequence[float],
-    *,
-    size: tuple[int, int],
-    focal: float,
-    yaw_deg: float = 0.0,
-    **lens: Any,
+    position_m: tuple[float, ...], *, size: tuple[int, int], focal: float, **others: Any
 ) -> Camera:
     width, height = size
-    T = np.eye(4)
-    T[:3, :3] = FORWARD @ Rotation.from_euler("z", -yaw_deg, degrees=True).as_matrix()
-    T[:3, 3] = -T[:3, :3] @ np.array(position_m)
-    intrinsics = Intrinsics(fx=focal, fy=0.995 * focal, cx=0.492 * width, cy=0.496 * height)
-    return Camera(
-        width_px=width, height_px=height, intrinsics_px=intrinsics, T_camera_lidar=T, **lens
-    )
+    lens = Intrinsics(fx=focal, fy=0.995 * focal, cx=0.492 * width, cy=0.496 * height)
+    return camera_at(size, lens, position_m, **others)
 
 
 def _on_ring(angle_deg: float, radius_m: float) -> tuple[float, float, float]:

@@ -3,8 +3,6 @@
 Python imports this module at its start where its folder is on the path.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import sys

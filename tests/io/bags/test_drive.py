@@ -1,7 +1,5 @@
 """Transforms and lenses of a drive: bad ones do not spoil it, and any of its bags may have them."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -18,8 +16,8 @@ from calibgraph import (
     load_rig,
 )
 from calibgraph.io.bags.rig import read_bag_rig
-from calibgraph.model.geometry import invert, relative_transform
-from tests.conftest import SAMPLE
+from calibgraph.model.geometry import invert, relative_transform, transform
+from tests.conftest import SAMPLE, require_poses
 from tests.io.bags.test_moving import messages as messages_of_a_drive
 from tests.io.bags.writing import (
     PERIOD_NS,
@@ -41,9 +39,7 @@ MAKE = Messages("mcap")
 def require_guess(bag: Path | list[Path]) -> tuple[str, ...]:
     """Check that the cameras are where the sample's guess has them; the notes."""
     data = load_dataset(bag)
-    for name, camera in RIG.cameras.items():
-        T = data.rig.cameras[name].T_camera_lidar
-        np.testing.assert_allclose(T, camera.T_camera_lidar, atol=1e-12)
+    require_poses(data.rig.T_camera_lidar, RIG.T_camera_lidar, atol=1e-12)
     return data.notes
 
 
@@ -119,8 +115,7 @@ def test_transforms_of_the_own_bag_count_first(tmp_path: Path) -> None:
     one = write_bag(tmp_path / "one", "mcap", sample_messages(MAKE))
     two = write_bag(tmp_path / "two", "mcap", other)
     options = BagOptions(beside=(two,))
-    for name, T in load_rig(one, options).T_camera_lidar.items():
-        np.testing.assert_allclose(T, RIG.T_camera_lidar[name], atol=1e-12)
+    require_poses(load_rig(one, options).T_camera_lidar, RIG.T_camera_lidar, atol=1e-12)
     assert read_bag_rig(one, options).notes == ()
 
 
@@ -244,8 +239,8 @@ def pair(  # noqa: PLR0913
 SHARED = [("velodyne", "stereo", invert(T_LEFT_LIDAR))]
 
 
-T_OWN_RIGHT = np.eye(4)  # R turns the axes of the image into those of the own frame
-T_OWN_RIGHT[:3, :3] = T_RIGHT_LEFT[:3, :3].T
+# R turns the axes of the image into those of the own frame
+T_OWN_RIGHT = transform(T_RIGHT_LEFT[:3, :3].T)
 FRAMES: dict[str, tuple[list[tuple[str, str, Any]], str]] = {  # of the second camera
     "stereo": (
         SHARED,
@@ -280,10 +275,8 @@ def test_a_baseline_along_any_axis_parts_the_cameras_as_recorded_and_rectified(
     shift = (0.3, -0.1, 0.02)
     bag = pair(tmp_path, ("stereo", "stereo"), SHARED, shift=shift, R=np.eye(3), image=image)
     T = load_rig(bag).T_camera_lidar
-    expected = np.eye(4)
-    expected[:3, 3] = shift
     found = relative_transform(T["front_right"], T["front_left"])
-    np.testing.assert_allclose(found, expected, atol=1e-9)
+    np.testing.assert_allclose(found, transform(np.eye(3), shift), atol=1e-9)
 
 
 @pytest.mark.parametrize("rectified", [False, True])

@@ -1,7 +1,5 @@
 """Messages of images and clouds, in any encoding and layout, are what was recorded."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 from typing import Any

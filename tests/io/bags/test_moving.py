@@ -1,7 +1,5 @@
 """Scans of a moving vehicle."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

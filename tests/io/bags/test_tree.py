@@ -1,7 +1,5 @@
 """The rig of a bag: topics, lenses, transforms, and the frames that live on in exports."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any
@@ -31,7 +29,7 @@ from calibgraph.io.bags.rig import doubtful_axes
 from calibgraph.io.bags.topics import choose_topics, is_rectified
 from calibgraph.io.bags.transforms import Transforms
 from calibgraph.io.rig_parts import Link, find_mounts
-from calibgraph.model.geometry import invert
+from calibgraph.model.geometry import invert, transform
 from tests.conftest import SAMPLE, make_camera
 from tests.io.bags.writing import (
     KINDS,
@@ -126,13 +124,6 @@ def test_what_cannot_be_chosen_is_offered(tmp_path: Path) -> None:
 TREE = "tf2_msgs/msg/TFMessage"
 
 
-def shifted(x: float, y: float, z: float, R: Any = None) -> Any:
-    T = np.eye(4)
-    T[:3, :3] = np.eye(3) if R is None else R
-    T[:3, 3] = x, y, z
-    return T
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_one_point_goes_through_the_tree_by_hand(tmp_path: Path, kind: str) -> None:
     # A LiDAR on a roof, 1 m ahead and 2 m above the base, turned to the left: its +x is the base's
@@ -141,13 +132,14 @@ def test_one_point_goes_through_the_tree_by_hand(tmp_path: Path, kind: str) -> N
     optical = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
     make = Messages(kind)
     edges = [
-        ("base", "lidar", shifted(1.0, 0.0, 2.0, turned_left)),
-        ("/base", "/body", shifted(0.5, 0.0, 1.5)),
-        ("body", "optical", shifted(0.0, 0.0, 0.0, optical)),
+        ("base", "lidar", transform(turned_left, [1.0, 0.0, 2.0])),
+        ("/base", "/body", transform(np.eye(3), [0.5, 0.0, 1.5])),
+        ("body", "optical", transform(optical)),
     ]
+    before = ("base", "lidar", transform(np.eye(3), [9.0, 9.0, 9.0]))  # the last counts
     messages = [
         Stamped("/tf_static", TREE, START_NS + n, make.transforms([edge]))
-        for n, edge in enumerate([("base", "lidar", shifted(9.0, 9.0, 9.0)), *edges])  # last counts
+        for n, edge in enumerate([before, *edges])
     ]
     transforms = Transforms([Bag(write_bag(tmp_path, kind, messages))])
     T_optical_lidar = transforms.between("optical", "lidar")
@@ -159,7 +151,7 @@ def test_one_point_goes_through_the_tree_by_hand(tmp_path: Path, kind: str) -> N
 
 
 def test_body_axes_in_place_of_optical_ones_are_noticed(tmp_path: Path) -> None:
-    edges = [("velodyne", "eye", shifted(0.5, 0.0, -0.3))]  # x ahead, as the LiDAR's
+    edges = [("velodyne", "eye", transform(np.eye(3), [0.5, 0.0, -0.3]))]  # x ahead, as the LiDAR's
     messages = [
         *sample_messages(MAKE)[-4:],
         Stamped("/left/camera_info", "sensor_msgs/msg/CameraInfo", START_NS,

@@ -1,7 +1,5 @@
 """Bags of the sample, written with rosbags: ROS 1, ROS 2 sqlite3 and MCAP."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -15,7 +13,7 @@ from numpy.typing import NDArray
 
 from calibgraph import Camera, Dataset, Rig, load_dataset
 from calibgraph.io.bags.messages import type_store
-from calibgraph.model.geometry import invert
+from calibgraph.model.geometry import invert, transform
 from tests.conftest import SAMPLE
 
 pytest.importorskip("rosbags")
@@ -200,11 +198,8 @@ def write_bag(
 
 def tree_of(rig: Rig) -> list[tuple[str, str, NDArray[np.float64]]]:
     """Transforms base -> LiDAR and base -> camera bodies -> optical frames, as a vehicle's URDF."""
-    T_base_lidar = np.eye(4)
-    T_base_lidar[:3, :3] = Rotation.from_euler("z", 30, degrees=True).as_matrix()
-    T_base_lidar[:3, 3] = 1.0, 0.2, 1.8
-    T_body_optical = np.eye(4)
-    T_body_optical[:3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
+    T_base_lidar = transform(Rotation.from_euler("z", 30, degrees=True), [1.0, 0.2, 1.8])
+    T_body_optical = transform([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])
     edges = [("base", "velodyne", T_base_lidar)]
     for name, camera in rig.cameras.items():
         T_base_optical = T_base_lidar @ invert(camera.T_camera_lidar)

@@ -1,7 +1,5 @@
 """The texts of ``forms.yaml`` for tests of commands."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

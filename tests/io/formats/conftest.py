@@ -1,25 +1,21 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from calibgraph import Calibration, Camera, MatcherErrors, Rig, simulate_correspondences, solve
+from calibgraph.model.geometry import transform
 from tests.conftest import make_camera, make_pair
 
 
 def moved_camera(rotvec: tuple[float, float, float], t: tuple[float, float, float]) -> Camera:
     """A camera with a rotation vector and translation of T_camera_lidar."""
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = Rotation.from_rotvec(rotvec).as_matrix(), t
-    return make_camera().moved_to(T)
+    return make_camera().moved_to(transform(Rotation.from_rotvec(rotvec), t))
 
 
 def rolled(camera: Camera, angle_rad: float) -> Camera:
     """The camera turned about its optical axis."""
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_rotvec([0, 0, angle_rad]).as_matrix()
-    return camera.moved_to(T @ camera.T_camera_lidar)
+    turn = transform(Rotation.from_euler("z", angle_rad))
+    return camera.moved_to(turn @ camera.T_camera_lidar)
 
 
 def varied_rig() -> Rig:

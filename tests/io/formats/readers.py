@@ -3,8 +3,6 @@
 Each reader gives T_camera_lidar per camera: from the LiDAR to the optical axes.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from math import cos, sin

@@ -1,7 +1,5 @@
 """Every exported file, read by an independent reader; lenses by the formulas of others."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -26,7 +24,7 @@ from calibgraph import (
 from calibgraph.io.formats import EXPORT_FORMATS
 from calibgraph.io.formats.export import TRANSFORMS, WRITERS
 from calibgraph.simulation.rigs import rig_of
-from tests.conftest import make_pair
+from tests.conftest import make_pair, require_poses
 from tests.io.formats.conftest import varied_rig
 from tests.io.formats.readers import READERS, angles_pose, worked_points
 
@@ -60,8 +58,7 @@ def test_the_lidars_mounting_moves_sensors_together(tmp_path: Path) -> None:
     assert "--lidar-pose puts it" in text
     pose = yaml.safe_load(text)["sensor_kit_base_link"]["lidar"]
     assert [pose[key] for key in ("x", "y", "z", "yaw")] == pytest.approx([1.2, -0.1, 1.9, 1.4])
-    for name, T in READERS["autoware"](tmp_path / "file.txt").items():
-        np.testing.assert_allclose(T, rig.T_camera_lidar[name], atol=1e-9)
+    require_poses(READERS["autoware"](tmp_path / "file.txt"), rig.T_camera_lidar, atol=1e-9)
 
 
 def test_names_of_frames_can_be_chosen(tmp_path: Path) -> None:

@@ -1,7 +1,5 @@
 """Files of other programs become a rig: ``forms.yaml`` has them, with what is expected of each."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path
@@ -11,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from scipy.spatial.transform import Rotation
 
 from calibgraph import (
     Calibration,
@@ -22,8 +21,9 @@ from calibgraph import (
     load_rig,
 )
 from calibgraph.io.formats.rig_import import read_rig_parts
+from calibgraph.model.geometry import transform
 from calibgraph.model.rig import KNOWLEDGE, IntrinsicsSigma
-from tests.conftest import RADTAN5, make_camera, stereo_relative_pose
+from tests.conftest import RADTAN5, make_camera, require_poses, stereo_relative_pose
 from tests.io.formats.calibration_files import FRONT
 from tests.io.formats.conftest import varied_rig
 from tests.io.written import written_kitti
@@ -170,8 +170,7 @@ def test_one_frame_serves_all_cameras_of_a_chain(tmp_path: Path) -> None:
     files = saved({"chain.yaml": chain, "car.urdf": TEXTS["urdf"]}, tmp_path)
     rig = import_rig(files, camera_frames={"cam0": "front_link"})
     expected = import_rig(saved({"whole.yaml": TEXTS["camchain"]}, tmp_path))
-    for name, T in expected.T_camera_lidar.items():
-        np.testing.assert_allclose(rig.T_camera_lidar[name], T, atol=1e-12)
+    require_poses(rig.T_camera_lidar, expected.T_camera_lidar, atol=1e-12)
 
 
 def test_a_kitti_sequence_is_imported(tmp_path: Path) -> None:
@@ -180,8 +179,7 @@ def test_a_kitti_sequence_is_imported(tmp_path: Path) -> None:
         rig = import_rig([path])
         expected = load_rig(folder)
         assert list(rig.cameras) == ["image_2", "image_3"]
-        for name, T in expected.T_camera_lidar.items():
-            np.testing.assert_allclose(rig.T_camera_lidar[name], T, atol=1e-15)
+        require_poses(rig.T_camera_lidar, expected.T_camera_lidar, atol=1e-15)
 
 
 def test_results_and_rig_files_are_imported_with_their_relative_poses(
@@ -212,9 +210,7 @@ def test_sentences_are_what_the_rig_was_made_of(name: str, said: str) -> None:
 def test_up_and_down_and_the_axis_z_are_in_the_sentences() -> None:
     camera = make_camera()
     for degrees in (20, 50):
-        angle = np.radians(degrees)
-        pitched = np.eye(4)
-        pitched[1:3, 1:3] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+        pitched = transform(Rotation.from_euler("x", degrees, degrees=True))
         # p' = Rx(angle) p: a point on the old axis appears above, so the camera looks down.
         down = Rig(cameras={"a": camera.moved_to(pitched @ camera.T_camera_lidar)})
         said = f"a looks along LiDAR +x, {degrees} deg down, sits at the LiDAR"

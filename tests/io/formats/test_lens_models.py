@@ -1,7 +1,5 @@
 """A lens model is understood under any key and name; an open one is asked, none is dropped."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Checkpoints and clouds that several tests of the learned matcher build."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -4,8 +4,6 @@ Nothing here is shared with the implementation: correlation by `grid_sample`, th
 whole, upsampling pixel by pixel. Weights come as a state dict.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import torch

@@ -1,7 +1,5 @@
 """Files of weights: good ones are read exactly; damaged, hostile and unsound ones are refused."""
 
-from __future__ import annotations
-
 import io
 import os
 import pickle

@@ -1,7 +1,5 @@
 """The network's inputs: projection, halving, encoding, padding, distortion."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

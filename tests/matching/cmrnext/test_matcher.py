@@ -1,7 +1,5 @@
 """The matcher cmrnext: true flow gives true poses; networks that only repeat something FAIL."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,13 +14,12 @@ from calibgraph import (
     Correspondences,
     Dataset,
     Rig,
-    evaluate,
     load_rig,
 )
 from calibgraph.matching.cmrnext import CmrNextMatcher
 from calibgraph.matching.cmrnext.flow_matching import FlowMatcher, MatchingJob, to_table
 from calibgraph.matching.cmrnext.inputs import LidarImage, network_size
-from tests.conftest import SAMPLE
+from tests.conftest import SAMPLE, require_near
 
 Array = NDArray[np.float64]
 
@@ -48,9 +45,7 @@ def replace_networks(
 
 def check_true_poses(result: Calibration, table: Correspondences, dataset: Dataset) -> None:
     """Sub-pixel consistent: half a pixel of shift would be 0.04 deg. Start 2 deg, 0.2 m off."""
-    for error in evaluate(result.rig, load_rig(SAMPLE / "reference.yaml")).cameras.values():
-        assert error.rotation_error_deg < 1e-3
-        assert error.translation_error_cm < 0.02
+    require_near(result.rig, load_rig(SAMPLE / "reference.yaml"), deg=1e-3, cm=0.02)
     assert all(check.status == "PASS" for check in result.verdict.checks)
     assert result.verdict.status != "FAIL"  # WARN for 0.8 %: tables of five frames are no better
     cloud = dataset.frames[3].load_cloud()[:, :3]
@@ -82,9 +77,7 @@ def test_true_flow_passes_the_checks_on_images(
     data = sample.select("0:5")
     result = calibgraph.calibrate(data, matcher=CmrNextMatcher([far_weights, far_weights]))
     assert result.correspondences is not None
-    for error in evaluate(result.rig, truth).cameras.values():
-        assert error.rotation_error_deg < 0.02
-        assert error.translation_error_cm < 0.4
+    require_near(result.rig, truth, deg=0.02, cm=0.4)
     assert all(check.status == "PASS" for check in result.verdict.checks)
     alone = calibgraph.solve(data.rig, result.correspondences)
     check_true_poses(alone, result.correspondences, data)

@@ -1,7 +1,5 @@
 """The network against its description, against published test vectors, and against itself."""
 
-from __future__ import annotations
-
 import zlib
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Data of the tests of the matcher `structure`: the sample, altered."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

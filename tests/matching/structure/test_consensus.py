@@ -1,7 +1,5 @@
 """The consensus of score grids, and the peaks beside it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The global search: its decisions with made-up poses; on the sample see test_matcher.py."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -12,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calibgraph import RelativePose, Rig
+from calibgraph import Rig
 from calibgraph.matching.structure import acceptance, global_search, pose_search
 from calibgraph.matching.structure.acceptance import (
     Chance,
@@ -29,6 +27,7 @@ from calibgraph.matching.structure.pose_search import (
     SearchRange,
 )
 from calibgraph.progress import no_progress
+from tests.conftest import stereo_relative_pose
 from tests.matching.structure.data import never
 
 NAMES = ("front_left", "front_right")
@@ -246,13 +245,7 @@ def test_a_camera_that_agrees_with_nothing_where_it_is_seen_remains_and_both_are
 def test_a_body_is_tried_at_the_guesses_of_all_its_cameras(two: Rig) -> None:
     """The lead's guess is far off, the other camera's is right, and the relative pose is known."""
     first, second = (two.T_camera_lidar[name] for name in NAMES)
-    pair = RelativePose(
-        a=NAMES[0],
-        b=NAMES[1],
-        T_a_b=first @ np.linalg.inv(second),
-        rotation_sigma_rad=0.001,
-        translation_sigma_m=0.002,
-    )
+    pair = stereo_relative_pose(two, *NAMES)
     rig = Rig(cameras=two.moved_to({NAMES[0]: off(first, 9.0)}).cameras, relative_poses=(pair,))
     located, _ = locate(MadeUp(rig, [(first, 30.0)]))
     for name, T in zip(NAMES, (first, second), strict=True):

@@ -1,7 +1,5 @@
 """The parts of the search: bodies, common features, correlation maps, the box about a guess."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -10,7 +8,7 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
 import calibgraph
-from calibgraph import RelativePose, Rig
+from calibgraph import Rig
 from calibgraph.matching.structure.bodies import adjoint, lead, place, place_member, rigid_bodies
 from calibgraph.matching.structure.box_search import BodyMaps, Box, search_box
 from calibgraph.matching.structure.common_features import CommonFeatures
@@ -20,18 +18,7 @@ from calibgraph.matching.structure.frame_cache import FrameCache, load_camera_fr
 from calibgraph.model.geometry import pose_difference
 from calibgraph.parallel import core_pool
 from calibgraph.solver.columns import apply_twist
-from tests.conftest import SAMPLE, make_camera
-
-
-def relative(rig: Rig, a: str, b: str, sigma_rad: float = 0.001) -> RelativePose:
-    T = rig.T_camera_lidar
-    return RelativePose(
-        a=a,
-        b=b,
-        T_a_b=T[a] @ np.linalg.inv(T[b]),
-        rotation_sigma_rad=sigma_rad,
-        translation_sigma_m=0.01,
-    )
+from tests.conftest import SAMPLE, make_camera, stereo_relative_pose
 
 
 @pytest.fixture
@@ -43,9 +30,8 @@ def test_tight_relative_poses_join_cameras_whatever_their_direction(
     truth: Rig, names: list[str]
 ) -> None:
     a, b, c = names
-    rig = truth.model_copy(
-        update={"relative_poses": (relative(truth, c, b), relative(truth, b, a))}
-    )
+    pairs = stereo_relative_pose(truth, c, b), stereo_relative_pose(truth, b, a)
+    rig = truth.model_copy(update={"relative_poses": pairs})
     (body,) = rigid_bodies(rig.moved_to({b: np.eye(4), c: np.eye(4)}))
     assert list(body)[0] == a
     for name in names:
@@ -53,7 +39,7 @@ def test_tight_relative_poses_join_cameras_whatever_their_direction(
 
 
 def test_a_moved_body_keeps_its_relative_poses(truth: Rig, names: list[str]) -> None:
-    pairs = tuple(relative(truth, names[0], name) for name in names[1:])
+    pairs = tuple(stereo_relative_pose(truth, names[0], name) for name in names[1:])
     (body,) = rigid_bodies(truth.model_copy(update={"relative_poses": pairs}))
     twist = np.array([1e-4, -2e-4, 1e-4, 2e-3, 1e-3, -1e-3])
     moved = place(body, apply_twist(lead(body), twist).T_camera_lidar)

@@ -1,7 +1,5 @@
 """Prepared images, and the scores of windows in them."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

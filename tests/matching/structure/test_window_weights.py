@@ -1,7 +1,5 @@
 """How much a window tells where it is."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Which points a camera sees, the nearest rays of a ray, and the windows made of them."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np
