@@ -42,6 +42,24 @@ class BlockSums:
     squares: Array | None = None
 
     @staticmethod
+    def unpack(sums: Array) -> BlockSums:
+        """From (r, 1 to 2, 2 + n, 1 + n) sums of the kernel."""
+        n = sums.shape[-1] - 1
+        hessian = sums[:, 0, :n, :n]
+        return BlockSums(
+            hessian,
+            sums[:, 0, :n, n],
+            sums[:, 0, -1, 0],
+            hessian - sums[:, 1, :n, :n] if sums.shape[1] > 1 else None,
+            weights=sums[:, 0, -1, 1],
+            squares=sums[:, 0, n, n],
+        )
+
+    def first(self) -> BlockSums:
+        """H, b and c of the first run alone."""
+        return BlockSums(self.hessian[0], self.gradient[0], self.cost[0])
+
+    @staticmethod
     def join(parts: Sequence[BlockSums]) -> BlockSums:
         """H, b and c of runs one after the other."""
         names = "hessian", "gradient", "cost"

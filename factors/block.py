@@ -141,8 +141,7 @@ class ProjectionBlock(RobustBlock):
 
     def sums(self, T_lidar_camera: gtsam.Pose3) -> BlockSums:
         """H, b and c of the whole block at a pose, in one pass over the data."""
-        sums = self.summarize(_T_camera_lidar(T_lidar_camera))
-        return BlockSums(sums.hessian[0], sums.gradient[0], sums.cost[0])
+        return self.summarize(contiguous(T_lidar_camera.inverse().matrix())[None]).first()
 
     def costs_at_each(self, T_camera_lidar: Array) -> Array:
         """(p,) c of the whole block at each of (p, 4, 4) poses."""
@@ -179,16 +178,10 @@ class ProjectionBlock(RobustBlock):
         sums = np.zeros((len(runs), 2 if curvature else 1, size + 2, size + 1))
         wanted = CURVATURE if curvature else PRODUCTS
         self._pass_over(
-            T_camera_lidar,
-            wanted,
-            sums,
-            free,
-            values,
-            runs=runs,
-            scales=scales,
+            T_camera_lidar, wanted, sums, free, values, runs=runs, scales=scales,
             step=contiguous(step),
-        )
-        return _unpack(sums)
+        )  # fmt: skip
+        return BlockSums.unpack(sums)
 
     def fit(
         self,
@@ -210,12 +203,11 @@ class ProjectionBlock(RobustBlock):
             (r, 4, 4) minima; the sums there; (r,) which ended by the tolerance.
         """
         sums, moved = np.zeros((len(runs), 1, 8, 7)), np.empty((len(runs), 4, 4))
-        ended = np.empty(len(runs), np.bool_)
+        moved[:], ended = T_camera_lidar, np.empty(len(runs), np.bool_)
         self._pass_over(
-            T_camera_lidar, PRODUCTS, sums, runs=runs, scales=scales, tolerance=tolerance,
-            moved=moved, flags=ended,
-        )  # fmt: skip
-        return moved, _unpack(sums), ended
+            moved, PRODUCTS, sums, runs=runs, scales=scales, tolerance=tolerance, flags=ended
+        )
+        return moved, BlockSums.unpack(sums), ended
 
     def columns(
         self, T_camera_lidar: Array, free: Columns | None = None, values: Array | None = None
@@ -246,17 +238,15 @@ class ProjectionBlock(RobustBlock):
         self._pass_over(T_camera_lidar, RESIDUALS, residuals, runs=runs, flags=valid)
         return residuals, valid
 
-    def run_norms(
-        self, T_camera_lidar: Array, runs: NDArray[np.int64] | None = None, *, factor: float = 1.0
-    ) -> Array:
-        """(2, n) norms of the unweighted [px] and of the whitened residuals, times a factor.
+    def run_norms(self, T_camera_lidar: Array, runs: NDArray[np.int64] | None = None) -> Array:
+        """(2, n) norms of the unweighted [px] and of the whitened residuals.
 
         One row if there is no whitening; infinite where a point is not projectable. The whitened
         ones are not divided by sigma. Arguments as of :meth:`residuals`.
         """
         norms = np.empty((1 if len(self._whitening) == 0 else 2, len(self)))
         valid = np.empty(len(self), np.bool_)
-        self._pass_over(T_camera_lidar, NORMS, norms, runs=runs, factor=factor, flags=valid)
+        self._pass_over(T_camera_lidar, NORMS, norms, runs=runs, flags=valid)
         return norms
 
     def _pass_over(
@@ -292,20 +282,6 @@ class ProjectionBlock(RobustBlock):
             return self._columns
         points = displace(self.points_lidar_m, self.motion[:, :6], late)
         return read_only(np.concatenate([points.T, self._columns[3:]]))
-
-
-def _unpack(sums: Array) -> BlockSums:
-    """From (r, 1 to 2, 8 + k, 7 + k) sums of the kernel."""
-    size = sums.shape[-1] - 1
-    hessian = sums[:, 0, :size, :size]
-    return BlockSums(
-        hessian,
-        sums[:, 0, :size, size],
-        sums[:, 0, -1, 0],
-        hessian - sums[:, 1, :size, :size] if sums.shape[1] > 1 else None,
-        weights=sums[:, 0, -1, 1],
-        squares=sums[:, 0, size, size],
-    )
 
 
 def block_factor(key: int, block: ProjectionBlock) -> gtsam.CustomFactor:
@@ -394,8 +370,3 @@ def projection_factor(
 
     base = gtsam.noiseModel.Gaussian.SqrtInformation(whitening)
     return custom_factor(cauchy_noise(base, scale), [key], linearize)
-
-
-def _T_camera_lidar(T_lidar_camera: gtsam.Pose3) -> Array:
-    """(1, 4, 4)."""
-    return contiguous(T_lidar_camera.inverse().matrix())[None]

@@ -71,7 +71,7 @@ WIDTH = 2 * TILE + 8
 NO_STEP = read_only(np.empty(0))
 NO_FREE = read_only(np.empty(0, np.int64)), NO_STEP, read_only(np.empty((0, 3, 0)))
 _NO_WHITENING = read_only(np.empty((0, 0)))
-_NO_POSES, _NO_FLAGS = np.empty((0, 4, 4)), np.empty(0, np.bool_)
+_NO_FLAGS = np.empty(0, np.bool_)
 _SMALL = 1e-100  # far from the smallest float by more than four factors
 
 
@@ -90,9 +90,7 @@ def pass_over(  # noqa: PLR0913 - the arguments of the kernel
     sigma: float = 1.0,
     free: tuple[NDArray[np.int64], Array, Array] = NO_FREE,
     step: Array = NO_STEP,
-    factor: float = 1.0,
-    tolerance: float = 0.0,
-    moved: Array = _NO_POSES,
+    tolerance: float = -1.0,
     flags: NDArray[np.bool_] = _NO_FLAGS,
 ) -> None:
     """Fill ``out`` with what is wanted of each of (r, 2) runs of correspondences.
@@ -100,13 +98,14 @@ def pass_over(  # noqa: PLR0913 - the arguments of the kernel
     Args:
         kind: of the lens.
         lens: (13,) its parameters.
-        T_camera_lidar: (r, 4, 4) of each run, or (1, 4, 4).
+        T_camera_lidar: (r, 4, 4) of each run, or (1, 4, 4). A fit fills in, in place of each, the
+            pose at which the cost of the run is least, and gives the sums there.
         columns: (5 or more, n) x y z u v.
         wanted: RESIDUALS to CURVATURE.
-        out: (n, 2) residuals pi - u [px]; (1 or 2, n) their norms, plain and whitened, times
-            ``factor``, infinite where a point is not projectable; (7 + k, 2, n) whitened columns
-            and last the residuals; or zeros (r, 1 to 2, 8 + k, 7 + k) for the sums: of each run H,
-            b in the last column and the sum of psi s in the corner; below, c and the sum of psi;
+        out: (n, 2) residuals pi - u [px]; (1 or 2, n) their norms, plain and whitened, infinite
+            where a point is not projectable; (7 + k, 2, n) whitened columns and last the
+            residuals; or zeros (r, 1 to 2, 8 + k, 7 + k) for the sums: of each run H, b in the last
+            column and the sum of psi s in the corner; below, c and the sum of psi;
             then, if there is room, - sum 2 psi' t t^T.
         runs: first correspondence, and the one behind the last; None: one run. Of residuals and
             norms, they hold every point once.
@@ -117,20 +116,16 @@ def pass_over(  # noqa: PLR0913 - the arguments of the kernel
         free: (k,) columns beside the pose, (k,) their units, and (m, 3, n) the displacements of the
             points in the LiDAR frame by those that displace them.
         step: (6 + k,) displaces the residuals by so much of the columns; or empty.
-        factor: of norms.
-        tolerance: relative decrease of the cost at which a fit is done.
-        moved: (r, 4, 4) is filled with the poses at which the cost of each run is least, and sums
-            are those there; of size zero: they are at the given ones.
+        tolerance: relative decrease of the cost at which a fit is done; negative: no fit.
         flags: (n,) is filled with whether each point is projectable; of a fit, (r,) whether it
             ended by the tolerance.
     """
     if runs is None:
         runs = np.array([[0, columns.shape[1]]])
-    numbers, units, moves = free
+    poses = T_camera_lidar if tolerance >= 0 else np.array(T_camera_lidar, order="C")
     _kernel(kind)(
-        lens, contiguous(T_camera_lidar), columns, whitening, contiguous(runs), scale, scales,
-        sigma, numbers, units, moves, step, wanted, factor, tolerance,
-        out.reshape((1,) * (4 - out.ndim) + out.shape), moved, flags,
+        lens, poses, columns, whitening, contiguous(runs), scale, scales, sigma, *free, step,
+        wanted, tolerance, out.reshape((1,) * (4 - out.ndim) + out.shape), flags,
     )  # fmt: skip
 
 
@@ -139,22 +134,23 @@ def _kernel(kind: int) -> Any:
     @compiled(fastmath=FAST)
     def pass_over_runs(  # type: ignore[no-untyped-def]
         lens, poses, columns, whitening, runs, scale, scales, sigma, free, units, moves, step,
-        wanted, factor, tolerance, out, moved, flags,
+        wanted, tolerance, out, flags,
     ):  # fmt: skip
         """See ``pass_over``; ``out`` has four axes."""
-        size = 7 + len(free)
+        size, fits = 7 + len(free), tolerance >= 0.0
         rows, bends, tile = np.empty((size, WIDTH)), np.empty((size, TILE)), np.empty((ROWS, TILE))
-        tried, sums, work = np.empty((2, 4, 4)), np.empty((2, size + 1, size)), np.empty((8, 6))
+        tried, sums, work = np.empty((2, 4, 4)), np.empty((2, size + 1, size)), np.empty((7, 6))
         has_rays = kind == PINHOLE and math.isinf(lens[LIMIT]) and len(whitening) < MATRICES
         has_rays = has_rays and (wanted < COLUMNS or (COST <= wanted <= PRODUCTS and size == 7))  # noqa: PLR2004
         for run in range(len(runs)):
-            best, new, damping = -1, 0, DAMPING
+            best, new = np.int64(0), np.int64(0)  # for a literal, parts would be compiled twice
+            damping, is_done = DAMPING, False
             width = sigma * (scales[run] if len(scales) else scale)
             copy(poses[run if len(poses) > 1 else 0], tried[0])
-            for _ in range(1 + MAX_STEPS if len(moved) else 1):
+            for trial in range(1 + MAX_STEPS if fits else 1):
                 T, found = tried[new], out[run if wanted >= COST else 0, 0]
-                found = sums[new] if len(moved) else found
-                for i in range(size + 1 if len(moved) else 0):
+                found = sums[new] if fits else found
+                for i in range(size + 1 if fits else 0):
                     for k in range(size):
                         found[i, k] = 0.0
                 for start in range(runs[run, 0], runs[run, 1], TILE):
@@ -174,7 +170,7 @@ def _kernel(kind: int) -> Any:
                                 out[0, 0, start + k, 0] = tile[RU, k]
                                 out[0, 0, start + k, 1] = tile[RV, k]
                         if wanted == NORMS:
-                            fill_norms(whitening, start, n, tile, factor, flags, out[0, 0])
+                            fill_norms(whitening, start, n, tile, flags, out[0, 0])
                         continue
                     if as_rays:
                         add_rays(lens, whitening, width, start, n, wanted, tile, found)
@@ -203,17 +199,18 @@ def _kernel(kind: int) -> Any:
                         add_products(n, bends, out[run, 1])
                     if wanted != COST:
                         add_weighted(n, psi, rows, found)
-                if not len(moved):
+                if not fits:
                     break
-                best, damping, is_done = judge(sums, best, new, work, damping, tolerance)
+                if trial > 0:
+                    best, damping, is_done = judge(sums, best, work, damping, tolerance)
                 flags[run] = is_done and damping < MAX_DAMPING
                 if is_done:
                     break
                 new = 1 - best
                 solve_damped(sums[best], damping, work)
                 move(-1.0, work[6], tried[best], tried[new])
-            if len(moved):
-                copy(tried[best], moved[run])
+            if fits:
+                copy(tried[best], poses[run])
                 copy(sums[best], out[run, 0])
             if wanted >= COST:
                 for part in range(out.shape[1]):
@@ -393,11 +390,11 @@ def weigh(scale, n, ru, rv, psi):  # type: ignore[no-untyped-def]
 
 
 @compiled(part=True, fastmath=FAST)
-def fill_norms(whitening, start, n, tile, factor, seen, norms):  # type: ignore[no-untyped-def]
-    """Fill in the norms of a tile's residuals times a factor, plain and whitened."""
+def fill_norms(whitening, start, n, tile, seen, norms):  # type: ignore[no-untyped-def]
+    """Fill in the norms of a tile's residuals, plain and whitened."""
     ru, rv = tile[RU], tile[RV]
     for i in range(n):
-        norms[0, np.uint64(start + i)] = factor * math.sqrt(ru[i] * ru[i] + rv[i] * rv[i])
+        norms[0, np.uint64(start + i)] = math.sqrt(ru[i] * ru[i] + rv[i] * rv[i])
     for i in range(n if len(whitening) else 0):
         at = np.uint64(start + i)
         if len(whitening) < MATRICES:
@@ -405,7 +402,7 @@ def fill_norms(whitening, start, n, tile, factor, seen, norms):  # type: ignore[
         else:
             u = whitening[0, at] * ru[i] + whitening[1, at] * rv[i]
             v = whitening[2, at] * rv[i]
-            norms[1, at] = factor * math.sqrt(u * u + v * v)
+            norms[1, at] = math.sqrt(u * u + v * v)
     for i in range(start, start + n):
         if not seen[i]:
             for row in range(len(norms)):  # a slice compiles for half a second

@@ -28,6 +28,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, Self
 
 import gtsam
@@ -38,7 +39,7 @@ from factors.arrays import BlockSums, RobustBlock, check_shape, contiguous
 from factors.block import ProjectionBlock
 from factors.columns import Columns
 from factors.compiled import compiled
-from factors.kernel import FAST, TILE, WIDTH, add_products, weigh
+from factors.kernel import FAST, TILE, WIDTH, add_weighted, complete, weigh
 from factors.lens import Lens, ray_spreads, unproject
 from factors.lens_kernels import is_projectable, project_one
 from factors.pose import lossless_factor
@@ -137,18 +138,15 @@ class PairBlock(RobustBlock):
     def sums(self, T_lidar_a: gtsam.Pose3, T_lidar_b: gtsam.Pose3) -> BlockSums:
         """H (12, 12), b (12,) and c, in GTSAM's tangents of both poses, first A's."""
         poses = T_lidar_a.matrix()[None], T_lidar_b.matrix()[None]
-        sums = self.run_sums(*poses, np.array([0, len(self)]))
-        return BlockSums(sums.hessian[0], sums.gradient[0], sums.cost[0])
+        return self.run_sums(*poses, np.array([0, len(self)])).first()
 
     def run_sums(self, T_lidar_a: Array, T_lidar_b: Array, edges: NDArray[np.int64]) -> BlockSums:
         """H, b and c of each run ``edges[i]:edges[i + 1]`` of the features, stacked.
 
         At (r, 4, 4) poses of each run, or (1, 4, 4) of all.
         """
-        sums, costs = np.zeros((len(edges) - 1, 13, 13)), np.zeros(len(edges) - 1)
         none = np.empty((0, 2)), np.empty(0, np.bool_)
-        self._evaluate(T_lidar_a, T_lidar_b, edges, (sums, costs, *none))
-        return BlockSums(sums[:, :12, :12], sums[:, :12, 12], costs)
+        return BlockSums.unpack(self._evaluate(T_lidar_a, T_lidar_b, edges, *none))
 
     def residuals(
         self, T_lidar_a: gtsam.Pose3, T_lidar_b: gtsam.Pose3
@@ -158,18 +156,20 @@ class PairBlock(RobustBlock):
         Of epipolar ones the second is zero.
         """
         residuals, visible = np.empty((len(self), 2)), np.empty(len(self), np.bool_)
-        poses, none = (T_lidar_a.matrix()[None], T_lidar_b.matrix()[None]), np.empty((0, 13, 13))
-        plain = self.rescale(scale=np.inf)
-        plain._evaluate(*poses, np.array([0, len(self)]), (none, none[:, 0, 0], residuals, visible))
+        poses = T_lidar_a.matrix()[None], T_lidar_b.matrix()[None]
+        self._evaluate(*poses, np.array([0, len(self)]), residuals, visible)
         return residuals, visible
 
     def _evaluate(
-        self, T_lidar_a: Array, T_lidar_b: Array, edges: NDArray[np.int64], out: tuple[Any, ...]
-    ) -> None:
-        _sum_runs(
-            self.kind, self.lens, contiguous(T_lidar_a), contiguous(T_lidar_b), self.features,
-            self.scale, self.sigma, contiguous(edges), *out,
+        self, T_lidar_a: Array, T_lidar_b: Array, edges: NDArray[np.int64], *out: NDArray[Any]
+    ) -> Array:
+        """The sums of runs; or fill in the residuals of all features, and which are visible."""
+        sums = np.zeros((len(edges) - 1, 1, 14, 13))
+        _kernel(self.kind)(
+            self.lens, contiguous(T_lidar_a), contiguous(T_lidar_b), self.features,
+            float(self.scale), float(self.sigma), contiguous(edges), sums, *out,
         )  # fmt: skip
+        return sums
 
 
 def pair_block_factor(key_a: int, key_b: int, block: PairBlock) -> gtsam.CustomFactor:
@@ -199,49 +199,44 @@ def placed_factor(
         if free is None or not isinstance(block, ProjectionBlock):
             return block.sums(*cameras), chain
         sums = block.summarize(cameras[0].inverse().matrix()[None], None, free, others[-1])
-        return BlockSums(sums.hessian[0], sums.gradient[0], sums.cost[0]), chain
+        return sums.first(), chain
 
     return lossless_factor(keys, sums_at, rows=size, columns=k)
 
 
-@compiled(fastmath=FAST)
-def _sum_runs(  # type: ignore[no-untyped-def]
-    kind, lens, T_a, T_b, features, scale, sigma, edges, sums, costs, residuals, visible
-):
-    """Fill (r, 13, 13): H and, in the last column, b; (r,) c. Or residuals, where there is room."""
-    axes, psi, rv = 1 if kind == EPIPOLAR else 2, np.empty(TILE), np.zeros(TILE)
-    tile = np.empty((13, WIDTH))
-    for run in range(len(edges) - 1):
-        T = T_a[run if len(T_a) > 1 else 0]
-        M = _relative_pose(T, T_b[run if len(T_b) > 1 else 0])
-        for start in range(edges[run], edges[run + 1], TILE):
-            n = min(TILE, edges[run + 1] - start)
-            for i in range(n):
-                feature, seen = features[start + i], True
-                if kind == EPIPOLAR:
-                    _fill_epipolar(M, feature, sigma, tile, i)
-                else:
-                    seen = _fill_surface(kind, lens, T, M, feature, sigma, tile, i, n)
-                    rv[i] = tile[12, n + i]
+@cache
+def _kernel(kind: int) -> Any:
+    @compiled(fastmath=FAST)
+    def sum_runs(lens, T_a, T_b, features, scale, sigma, edges, sums, residuals, visible):  # type: ignore[no-untyped-def]
+        """Fill in zeros (r, 1, 14, 13), see ``kernel``; or residuals, where there is room."""
+        tile, psi = np.empty((13, WIDTH)), np.empty(TILE)
+        for run in range(len(sums)):
+            T, found = T_a[run if len(T_a) > 1 else 0], sums[run, 0]
+            M = _relative_pose(T, T_b[run if len(T_b) > 1 else 0])
+            for start in range(edges[run], edges[run + 1], TILE):
+                n = min(TILE, edges[run + 1] - start)
+                for i in range(n):
+                    seen = True
+                    if kind == EPIPOLAR:
+                        _fill_epipolar(M, features[start + i], tile, i, n)
+                    else:
+                        seen = _fill_surface(kind, lens, T, M, features[start + i], tile, i, n)
+                    if len(residuals):
+                        residuals[start + i, 0] = tile[12, i]
+                        residuals[start + i, 1] = tile[12, n + i]
+                        visible[start + i] = seen
                 if len(residuals):
-                    residuals[start + i, 0], residuals[start + i, 1] = tile[12, i], rv[i]
-                    visible[start + i] = seen
-            if len(residuals):
-                continue
-            costs[run] += weigh(scale, n, tile[12], rv, psi)
-            for i in range(n):
-                root = math.sqrt(psi[i])
-                for row in range(13):
-                    for axis in range(axes):
-                        tile[row, axis * n + i] *= root
-            add_products(axes * n, tile, sums[run])
-        for i in range(12 if len(sums) else 0):
-            for j in range(i):
-                sums[run, i, j] = sums[run, j, i]
+                    continue
+                left = tile[12]
+                found[13, 0] += weigh(scale * sigma, n, left, left[n:], psi)
+                add_weighted(n, psi, tile, found)
+            complete(sigma, found)
+
+    return sum_runs
 
 
-@compiled(part=True)
-def _fill_surface(kind, lens, T_a, M, feature, sigma, tile, i, n):  # type: ignore[no-untyped-def]
+@compiled(inline="always")
+def _fill_surface(kind, lens, T_a, M, feature, tile, i, n):  # type: ignore[no-untyped-def]
     """Fill in derivatives by A and B, and residuals; return whether B sees the point."""
     f0, f1, f2 = feature[0], feature[1], feature[2]
     q0, q1, q2 = feature[3], feature[4], feature[5]
@@ -255,11 +250,10 @@ def _fill_surface(kind, lens, T_a, M, feature, sigma, tile, i, n):  # type: igno
     y1 = M[1, 0] * f0 + M[1, 1] * f1 + M[1, 2] * f2 + w * M[1, 3]
     y2 = M[2, 0] * f0 + M[2, 1] * f1 + M[2, 2] * f2 + w * M[2, 3]
     u, v, ux, uy, uz, vx, vy, vz = project_one(kind, lens, y0, y1, y2)
-    tile[12, i] = (u - feature[6]) / sigma
-    tile[12, n + i] = (v - feature[7]) / sigma
+    tile[12, i], tile[12, n + i] = u - feature[6], v - feature[7]
     for row in range(2):
         jx, jy, jz = (ux, uy, uz) if row == 0 else (vx, vy, vz)
-        jx, jy, jz, at = jx / sigma, jy / sigma, jz / sigma, row * n + i
+        at = row * n + i
         along = (jx * M[0, 3] + jy * M[1, 3] + jz * M[2, 3]) / k
         a0 = jx * M[0, 0] + jy * M[1, 0] + jz * M[2, 0] + along * g0  # in A's axes
         a1 = jx * M[0, 1] + jy * M[1, 1] + jz * M[2, 1] + along * g1
@@ -272,8 +266,8 @@ def _fill_surface(kind, lens, T_a, M, feature, sigma, tile, i, n):  # type: igno
 
 
 @compiled(part=True)
-def _fill_epipolar(M, feature, sigma, tile, at):  # type: ignore[no-untyped-def]
-    """Fill in derivatives by A and B, and the residual."""
+def _fill_epipolar(M, feature, tile, at, n):  # type: ignore[no-untyped-def]
+    """Fill in derivatives by A and B, and the residual; those of a second one are zero."""
     value, half, square = np.empty(7), np.zeros(6), 0.0
     for x, y in ((3, 9), (6, 9), (0, 12), (0, 15)):
         _fill_form(M, feature[x : x + 3], feature[y : y + 3], value)
@@ -281,7 +275,7 @@ def _fill_epipolar(M, feature, sigma, tile, at):  # type: ignore[no-untyped-def]
         for k in range(6):
             half[k] += value[k] * value[6]
     _fill_form(M, feature[0:3], feature[9:12], value)
-    over = 1.0 / (sigma * math.sqrt(square)) if square > _LEAST_SQUARE else 0.0
+    over = 1.0 / math.sqrt(square) if square > _LEAST_SQUARE else 0.0
     for k in range(6 if over > 0.0 else 0):
         value[k] -= value[6] / square * half[k]
     for k in range(7):
@@ -293,6 +287,8 @@ def _fill_epipolar(M, feature, sigma, tile, at):  # type: ignore[no-untyped-def]
     for k in range(3):
         tile[k, at] = -(w0 * M[0, k] + w1 * M[1, k] + w2 * M[2, k])
         tile[3 + k, at] = -(v0 * M[0, k] + v1 * M[1, k] + v2 * M[2, k])
+    for k in range(13):
+        tile[k, n + at] = 0.0
 
 
 @compiled(part=True)

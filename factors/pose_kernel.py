@@ -102,13 +102,12 @@ def logarithms(steps):  # type: ignore[no-untyped-def]
 
 
 @compiled(part=True)
-def judge(sums, best, new, work, damping, tolerance):  # type: ignore[no-untyped-def]
+def judge(sums, best, work, damping, tolerance):  # type: ignore[no-untyped-def]
     """Judge a step of Levenberg-Marquardt: taken where the cost does not rise.
 
     Args:
         sums: (2, 8, 7) of both poses: upper triangle of H, b in the last column, and c below.
-        best: which pose it is from; negative: none.
-        new: which pose it is to.
+        best: which pose it is from; it is to the other one.
         work: of :func:`solve_damped`.
         damping: as it was.
         tolerance: relative decrease of the cost at which the fit is done.
@@ -116,43 +115,36 @@ def judge(sums, best, new, work, damping, tolerance):  # type: ignore[no-untyped
     Returns:
         Which pose is the best; the next damping; whether the fit is done.
     """
-    if best < 0:
-        return new, damping, False
-    gain, size = sums[best, 7, 0] - sums[new, 7, 0], 0.0
+    gain, size = sums[best, 7, 0] - sums[1 - best, 7, 0], 0.0
     for i in range(work.shape[1]):
         size = max(size, abs(work[6, i]))
     is_done = size < _SMALL_STEP or (gain >= 0.0 and gain <= tolerance * sums[best, 7, 0])
     damping = max(damping * (0.1 if gain >= 0.0 else 10.0), _MIN_DAMPING)
-    return new if gain >= 0.0 else best, damping, is_done or not damping < MAX_DAMPING
+    return 1 - best if gain >= 0.0 else best, damping, is_done or not damping < MAX_DAMPING
 
 
 @compiled(part=True)
 def solve_damped(sums, damping, work):  # type: ignore[no-untyped-def]
-    """Fill in ``work[6]``, of (8, 6), with the step to the minimum of a cost, by Cholesky's root.
+    """Fill in ``work[6]``, of (7, 6), with the step to the minimum of a cost, by Cholesky's root.
 
-    The diagonal, scaled to one, is that much larger; a direction that is free gets no step.
+    The diagonal is that much larger; a direction that is free gets no step.
     """
-    n, step, units = work.shape[1], work[6], work[7]
+    n, step = work.shape[1], work[6]
     for row in range(n):
-        size = sums[row, row]
-        units[row] = 1.0 / math.sqrt(max(size, _LEAST)) if size > 0.0 else 0.0
-    for row in range(n):
-        step[row] = units[row] * sums[row, n]
-        for column in range(row):
-            rest = sums[column, row] * units[row] * units[column]
+        step[row] = -sums[row, n]
+        for column in range(row + 1):
+            rest = sums[column, row]
+            if column == row:
+                rest *= 1.0 + damping
             for m in range(column):
                 rest -= work[row, m] * work[column, m]
-            work[row, column] = rest / work[column, column]
-            step[row] -= work[row, column] * step[column]
-        rest = 1.0 + damping
-        for m in range(row):
-            rest -= work[row, m] * work[row, m]
-        work[row, row] = math.sqrt(max(rest, _LEAST))
+            rest = rest / work[column, column] if column < row else math.sqrt(max(rest, _LEAST))
+            work[row, column] = rest
+            if column < row:
+                step[row] -= rest * step[column]
         step[row] /= work[row, row]
     for behind in range(n):
         row = n - 1 - behind
         for m in range(row + 1, n):
             step[row] -= work[m, row] * step[m]
         step[row] /= work[row, row]
-    for row in range(n):
-        step[row] *= -units[row]

@@ -282,7 +282,7 @@ def test_norms_are_those_of_the_residuals_and_infinite_behind_the_camera(lens: s
     T = T_camera_lidar()
     T[3] = np.diag([-1.0, 1, -1, 1]) @ T[0]
     for block in blocks(lens):
-        norms = block.run_norms(T, to_runs(EDGES), factor=0.5)
+        norms = block.run_norms(T, to_runs(EDGES))
         residuals, projectable = block.residuals(T, to_runs(EDGES))
         assert (np.isfinite(norms) == projectable).all()
         assert not projectable.all()
@@ -293,5 +293,5 @@ def test_norms_are_those_of_the_residuals_and_infinite_behind_the_camera(lens: s
             norms, (np.hypot(x, y), np.hypot(a * x + b * y, c * y)), strict=False
         ):
             np.testing.assert_allclose(
-                found[projectable], 0.5 * expected[projectable], rtol=1e-12, atol=1e-12
+                found[projectable], expected[projectable], rtol=1e-12, atol=1e-12
             )
