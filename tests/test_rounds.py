@@ -259,8 +259,9 @@ def test_without_time_terms_or_files_the_run_stays_as_it_is(
     stage1 = matched(data, table, "stage1")
     assert refine_with_camera_pairs(stage1) is stage1
     gone = {name: tmp_path / "gone.png" for name in truth.cameras}
-    frames = tuple(replace(frame, image_paths=gone) for frame in data.frames)
-    blind = replace(run, dataset=replace(data, frames=frames))
+    read = calibgraph.load_dataset(SAMPLE, truth)  # as none of them is kept
+    frames = tuple(replace(frame, image_paths=gone) for frame in read.frames)
+    blind = replace(run, dataset=replace(read, frames=frames))
     assert refine_with_camera_pairs(blind) is blind
 
 
