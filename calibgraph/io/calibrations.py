@@ -99,6 +99,8 @@ class _FrameEntry(BaseModel):
     name: str
     cloud: str
     images: dict[str, str]
+    lidars: dict[str, str] | None = None
+    joined: dict[str, tuple[tuple[Finite, ...], ...]] | None = None
     motion: _Motion | None = None
     cloud_columns: tuple[str, ...] | None = None
 
