@@ -269,7 +269,7 @@ def start_cameras(state: State, table: Correspondences, seen: Collection[int]) -
 
 
 def _try_to_start(state: State, camera: int) -> tuple[str, ...]:
-    """Start a camera by the batch solve of its first frames, or tell why not."""
+    """Start a camera by the batch solve of its first frames; the reasons if it fails."""
     name = state.names[camera]
     rig = Rig(lidar=state.rig.lidar, cameras={name: state.rig.cameras[name]})
     try:

@@ -182,8 +182,8 @@ class Terms:
 class Eliminated(NamedTuple):
     """Some places without their poses (``calibgraph.solver.places``).
 
-    What is left is a quadratic on the cloud's and the cameras' shared steps. It knows them by
-    where matches show the cameras, r: the rows of ``by``.
+    What is left is a quadratic in the steps of the cloud and of the cameras that all places share.
+    It depends on them through r, where matches show the cameras.
 
     Attributes:
         hessian: (6 + 6 n, 6 + 6 n) sum over the places.
