@@ -46,7 +46,7 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
         os.umask(umask)
         temporary.chmod(0o666 & ~umask)
         temporary.replace(path)
-        sync_folder(path.parent)
+        sync_to_disk(path.parent)
     except OSError as error:
         if error.filename and not str(error.filename).startswith(f"{path.parent}/.writing-"):
             raise  # of another file, which is read
@@ -158,7 +158,7 @@ def written_together(folder: Path, *, last: str) -> Iterator[Path]:
                 new.replace(folder / new.name)
             except OSError as error:
                 raise cannot_write(folder / new.name, error) from error
-        sync_folder(folder)
+        sync_to_disk(folder)
 
 
 def is_utf8(name: str) -> bool:
@@ -166,9 +166,9 @@ def is_utf8(name: str) -> bool:
     return not any("\ud800" <= letter <= "\udfff" for letter in name)
 
 
-def sync_folder(folder: Path) -> None:
-    """Make the renames in a folder durable."""
-    descriptor = os.open(folder, os.O_RDONLY)
+def sync_to_disk(path: Path) -> None:
+    """Make a file durable, or the renames in a folder."""
+    descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
     finally:

@@ -209,6 +209,6 @@ def _motion(
         return None
     rows = match_features(before, after)
     T = lens.T_camera_lidar
-    near, points = points_at(before.rays[rows[:, 0]], cloud @ T[:3, :3].T + T[:3, 3])
-    T_later_earlier = relative_pose(points, after.rays[rows[near, 1]], seed=seed)
+    near, points = points_at(before["ray"][rows[:, 0]], cloud @ T[:3, :3].T + T[:3, 3])
+    T_later_earlier = relative_pose(points, after["ray"][rows[near, 1]], seed=seed)
     return None if T_later_earlier is None else invert(T) @ T_later_earlier @ T

@@ -6,7 +6,7 @@ import shutil
 from pathlib import Path
 
 from calibgraph.errors import FileError
-from calibgraph.files import require_place_for_folder, sync_folder
+from calibgraph.files import require_place_for_folder, sync_to_disk
 
 INPUT, SCRATCH, WORK, RESULT, LOG = "input", "scratch", "work", "result", "log.txt"
 """In a job's folder: its input, its working folder, its result as it is written, then; its log."""
@@ -40,13 +40,9 @@ class DataFolder:
     def keep(self, arrived: Path) -> None:
         """Put an upload on disk, and give it its place among the jobs."""
         for path in (*arrived.rglob("*"), arrived):
-            descriptor = os.open(path, os.O_RDONLY)
-            try:
-                os.fsync(descriptor)
-            finally:
-                os.close(descriptor)
+            sync_to_disk(path)
         arrived.rename(self.of_job(arrived.name))
-        sync_folder(self.jobs)
+        sync_to_disk(self.jobs)
 
     def close(self) -> None:
         """Release the folder."""

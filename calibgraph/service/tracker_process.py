@@ -12,7 +12,7 @@ import pyarrow as pa
 
 from calibgraph.child_process import answer_requests, describe_failure, memory_limit
 from calibgraph.errors import CalibrationError, MotionError
-from calibgraph.files import sync_folder, write_bytes, write_text
+from calibgraph.files import sync_to_disk, write_bytes, write_text
 from calibgraph.io.rigs import load_rig
 from calibgraph.io.tables import from_arrow
 from calibgraph.model.config import config_from
@@ -40,7 +40,7 @@ def answer(held: Held, request: tuple[str, Path, bytes, str]) -> tuple[int, str]
             folder.mkdir(mode=0o700)
             write_text(settings, config)
             write_bytes(rig, body)
-            sync_folder(folder.parent)
+            sync_to_disk(folder.parent)
         if method != "DELETE":
             if folder not in held:
                 given = config_from(json.loads(settings.read_text()), "config")

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from calibgraph.errors import CorrespondenceError, FileError
-from calibgraph.files import cannot_write, require_place_for_folder, sync_folder
+from calibgraph.files import cannot_write, require_place_for_folder, sync_to_disk
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.rig import Rig
@@ -198,7 +198,7 @@ class StateDatabase:
         new = [part for part in (folder, *folder.parents) if not part.exists()]
         folder.mkdir(parents=True, exist_ok=True)
         for part in new:
-            sync_folder(part.parent)
+            sync_to_disk(part.parent)
         self._path = folder / DATABASE
         try:
             self._connection = sqlite3.connect(

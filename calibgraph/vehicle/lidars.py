@@ -12,8 +12,8 @@ the covariance is wider by that.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Container, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import permutations
 
 import numpy as np
@@ -81,6 +81,15 @@ class LidarPoses:
         rows = [slice(6 * row, 6 * row + 6) for row in range(len(self.T_base_lidar) - 1)]
         names = [name for name in self.T_base_lidar if name != self.base]
         return {n: self.joint_covariance[of, of] for n, of in zip(names, rows, strict=True)}
+
+    def without(self, names: Container[str]) -> LidarPoses:
+        """The poses of the others."""
+        kept = [row for row, name in enumerate(self.covariance) if name not in names]
+        rows = [6 * row + axis for row in kept for axis in range(6)]
+        T = {name: own for name, own in self.T_base_lidar.items() if name not in names}
+        return replace(
+            self, T_base_lidar=T, joint_covariance=self.joint_covariance[np.ix_(rows, rows)]
+        )
 
 
 def calibrate_lidars(

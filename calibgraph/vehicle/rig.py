@@ -89,7 +89,7 @@ def calibrate_rig_lidars(
         dataset: its frames have the clouds of all LiDARs; those that lack one are left out.
         rig: with the guess of each LiDAR, or none.
         config: the tolerance of the verdict.
-        place: finds by cameras a LiDAR that shares too little, and has a guess.
+        place: finds by cameras a LiDAR with a guess that planes do not determine.
         progress: called with the stage, its steps done, and their number.
 
     Raises:
@@ -110,7 +110,7 @@ def calibrate_rig_lidars(
     progress("locating LiDARs", 0, 1)
     views = _look(instants, guess, rig.lidar)
     start, doubts, lost = locate_lidars(views, guess, base=rig.lidar)
-    parts = list[LidarPoses]()
+    parts, placed = list[LidarPoses](), dict[str, LidarPoses]()
     if lost:
         progress("joining LiDARs by motion", 0, 1)
         far = {name: T for name, T in guess.items() if name not in start}
@@ -121,14 +121,23 @@ def calibrate_rig_lidars(
         except CalibrationError:
             if len(known) < len(far):
                 raise
-            parts = [] if place is None else _placed(known, place)
-            line = f"{', '.join(far)} and {rig.lidar} share too little: placed by cameras"
-            if not parts:
-                start, line = {**start, **known}, f"{lost}; begun from the guess"
+            placed, line = _placed(known, place), lost
+            if missing := known.keys() - placed.keys():
+                start, line = (
+                    {**start, **{n: known[n] for n in missing}},
+                    f"{lost}; begun from the guess",
+                )
         warnings.append(line)
     progress("calibrating LiDARs", 0, 1)
     if start:
-        parts.append(_solve(instants, views, start, base=rig.lidar))
+        found = _solve(instants, views, start, base=rig.lidar)
+        loose = [name for name in start if _loose(found.covariance[name], rig.lidar)]
+        placed |= _placed([name for name in loose if guess[name] is not None], place)
+        parts.append(found.without(placed))
+    if placed:
+        parts += placed.values()
+        seen = f"placed by cameras that see what it and {rig.lidar} see"
+        warnings.append(f"{', '.join(placed)}: {seen}")
     poses = join_poses(parts, [rig.lidar, *guess])
     clouds = _at_stamps(instants, poses.T_base_lidar)
     vehicle = None
@@ -149,13 +158,18 @@ def calibrate_rig_lidars(
     )
 
 
-def _placed(names: Iterable[str], place: Callable[[str], LidarPoses]) -> list[LidarPoses]:
-    """The poses of LiDARs by cameras; none where no camera is calibrated to both."""
-    try:
-        return [place(name) for name in names]
-    except CalibrationError as error:
-        _log.info("%s", error)
-        return []
+def _placed(
+    names: Iterable[str], place: Callable[[str], LidarPoses] | None
+) -> dict[str, LidarPoses]:
+    """The poses of LiDARs by cameras; without those that no camera is calibrated to."""
+    found = {}
+    for name in names:
+        try:
+            if place is not None:
+                found[name] = place(name)
+        except CalibrationError as error:
+            _log.info("%s", error)
+    return found
 
 
 def _look(

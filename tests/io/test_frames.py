@@ -21,7 +21,7 @@ from calibgraph.io.bags.pictures import image_from_message
 from calibgraph.io.dataset import keep_frames
 from calibgraph.io.frame import ScanMotion, twist_between
 from calibgraph.io.images import load_image
-from calibgraph.matching.camera_pairs.find import Features, features_of
+from calibgraph.matching.camera_pairs.find import FEATURE, Features, features_of
 from calibgraph.matching.structure.frame_cache import FrameCache, cache_of
 from calibgraph.pipeline import hash_inputs
 from tests.conftest import SAMPLE, make_camera
@@ -227,9 +227,9 @@ def test_features_of_kept_frames_are_found_once_per_lens() -> None:
     other = camera.model_copy(
         update={"intrinsics_px": camera.intrinsics_px.model_copy(update={"fx": 500.0})}
     )
-    assert not np.allclose(features_of(frame, "left", other).rays, found.rays)
+    assert not np.allclose(features_of(frame, "left", other)["ray"], found["ray"])
     plain = features_of(data.frames[0], "left", camera)
-    np.testing.assert_array_equal(plain.descriptors, found.descriptors)
+    np.testing.assert_array_equal(plain, found)
 
 
 def test_kept_frames_share_one_cache_of_windows() -> None:
@@ -254,7 +254,7 @@ def test_what_was_used_last_is_kept_up_to_a_size(monkeypatch: pytest.MonkeyPatch
 
 
 def of(rows: int) -> Features:
-    return Features(np.zeros((rows, 2)), np.zeros((rows, 3)), np.zeros((rows, 128), np.float32))
+    return np.zeros(rows, FEATURE)
 
 
 def size(rows: int) -> int:

@@ -108,7 +108,7 @@ def test_its_features_match_no_more() -> None:
     for each in (data, hidden):
         one, two = (features_of(each.frames[0], n, data.rig.cameras[n]) for n in PAIR)
         rows = match_features(one, two)
-        apart = np.linalg.norm(one.pixels_px[rows[:, 0]] - two.pixels_px[rows[:, 1]], axis=1)
+        apart = np.linalg.norm((one[rows[:, 0]]["pixel_px"] - two[rows[:, 1]]["pixel_px"]), axis=1)
         counts.append(int(np.sum(apart < 1.0)))
     assert counts[0] > 20 and counts[1] == 0
 

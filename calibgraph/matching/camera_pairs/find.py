@@ -6,7 +6,7 @@ Features are SIFT keypoints and descriptors, with the rays of the keypoints.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from itertools import combinations
 
@@ -89,7 +89,7 @@ def _match_frame(
     matches = {}
     for a, b in seen:
         rows = match_features(features[a], features[b])
-        matches[a, b] = features[a].select(rows[:, 0]), features[b].select(rows[:, 1])
+        matches[a, b] = features[a][rows[:, 0]], features[b][rows[:, 1]]
     return matches
 
 
@@ -138,18 +138,17 @@ def _agreeing(
     """The matches of a pair that agree on an epipolar geometry, over all its frames."""
     cameras = tuple(rig.cameras)
     a, b = (rig.cameras[name] for name in pair)
-    sides = [[part[1] for part in parts], [part[2] for part in parts]]
-    rays = [np.concatenate([features.rays for features in side]) for side in sides]
-    agrees = agree_on_epipolar_geometry(a, b, *rays, seed=seed)
-    pixels = [np.concatenate([features.pixels_px for features in side]) for side in sides]
-    frame = np.concatenate([np.full(len(one.rays), index) for index, one, _ in parts])
+    frames, *sides = zip(*parts, strict=True)
+    both = [np.concatenate(side) for side in sides]
+    agrees = agree_on_epipolar_geometry(a, b, both[0]["ray"], both[1]["ray"], seed=seed)
+    frame = np.repeat(frames, [len(one) for one in sides[0]])
     n = int(np.count_nonzero(agrees))
     numbers = np.array([cameras.index(name) for name in pair], np.int32)
     return CameraMatches(
         cameras=cameras,
         camera_index=np.tile(numbers, (n, 1)),
         frame=frame[agrees].astype(np.int64),
-        pixels_px=np.stack(pixels, axis=1)[agrees],
+        pixels_px=np.stack([side["pixel_px"] for side in both], axis=1)[agrees],
         planes_lidar_per_m=np.full((n, 2, 3), np.nan),
     )
 
@@ -189,28 +188,10 @@ MAX_FEATURES = 4000  # per image
 LOWE_RATIO = 0.8  # of the distances of the best and the second best match, at most
 
 
-@dataclass(frozen=True, eq=False)
-class Features:
-    """Features of one image.
-
-    Attributes:
-        pixels_px: (n, 2) column and row.
-        rays: (n, 3) unit viewing rays in the camera frame.
-        descriptors: (n, 128) float32.
-    """
-
-    pixels_px: Array
-    rays: Array
-    descriptors: NDArray[np.float32]
-
-    @property
-    def nbytes(self) -> int:
-        """Size in memory."""
-        return self.pixels_px.nbytes + self.rays.nbytes + self.descriptors.nbytes
-
-    def select(self, rows: NDArray[np.intp]) -> Features:
-        """Some of the features, by their rows."""
-        return Features(self.pixels_px[rows], self.rays[rows], self.descriptors[rows])
+FEATURE = np.dtype([("pixel_px", "f8", 2), ("ray", "f8", 3), ("descriptor", "f4", 128)])
+"""A feature of an image: column and row, the unit viewing ray in the camera frame, and SIFT's."""
+Features = NDArray[np.void]
+"""(n,) of FEATURE."""
 
 
 def features_of(frame: Frame, name: str, camera: Camera) -> Features:
@@ -234,14 +215,16 @@ def detect_features(gray: Gray, camera: Camera) -> Features:
     sift = cv2.SIFT.create(nfeatures=MAX_FEATURES, enable_precise_upscale=True)
     points, descriptors = sift.detectAndCompute(small, None)
     if not points:
-        return Features(np.empty((0, 2)), np.empty((0, 3)), np.empty((0, 128), np.float32))
+        return np.empty(0, FEATURE)
     scale = np.array([gray.shape[1] / small.shape[1], gray.shape[0] / small.shape[0]])
     pixels = (np.array([point.pt for point in points]) + 0.5) * scale - 0.5
     # A keypoint with several orientations comes several times; they are no independent matches.
     rows = np.sort(np.unique(pixels.round(2), axis=0, return_index=True)[1])
     rays, valid = unproject(camera.lens, pixels[rows])
-    rows, rays = rows[valid], rays[valid]
-    return Features(pixels[rows], rays, np.asarray(descriptors, np.float32)[rows])
+    found = np.empty(np.count_nonzero(valid), FEATURE)
+    found["pixel_px"], found["ray"] = pixels[rows[valid]], rays[valid]
+    found["descriptor"] = descriptors[rows[valid]]
+    return found
 
 
 def match_features(a: Features, b: Features) -> NDArray[np.intp]:
@@ -249,9 +232,10 @@ def match_features(a: Features, b: Features) -> NDArray[np.intp]:
 
     Clearly: the second best of B is farther from A's feature by the ratio of Lowe (2004).
     """
-    if min(len(a.rays), len(b.rays)) < 2:  # noqa: PLR2004
+    if min(len(a), len(b)) < 2:  # noqa: PLR2004
         return np.empty((0, 2), np.intp)
-    unit = [f.descriptors / np.linalg.norm(f.descriptors, axis=1, keepdims=True) for f in (a, b)]
+    unit = [each / np.linalg.norm(each, axis=1, keepdims=True)
+            for each in (a["descriptor"], b["descriptor"])]  # fmt: skip
     cosine = unit[0] @ unit[1].T
     rows, best = np.arange(len(cosine)), cosine.argmax(axis=1)
     first, of_b = cosine[rows, best].copy(), cosine.max(axis=0)
