@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from factors import kernel
-from factors.arrays import contiguous, read_only
+from factors.arrays import read_only
 from factors.lens import Lens
 from factors.lens_kernels import FISHEYE, OMNIDIRECTIONAL, PINHOLE
 from factors.pose_kernel import exponential_times
@@ -80,9 +80,9 @@ def displace(points_m: Array, twists_per_s: Array, seconds: ArrayLike) -> Array:
     """
     steps = np.empty((len(points_m), 6))
     steps[:] = np.reshape(seconds, (-1, 1)) * twists_per_s
-    T, moved = np.tile(np.eye(4), (len(steps), 1, 1)), np.empty((len(steps), 4, 4))
-    exponential_times(contiguous(steps), contiguous(T), moved)
-    return np.asarray(np.einsum("nij,nj->ni", moved[:, :3, :3], points_m) + moved[:, :3, 3])
+    T = np.tile(np.eye(4), (len(steps), 1, 1))
+    exponential_times(steps, T)
+    return np.asarray(np.einsum("nij,nj->ni", T[:, :3, :3], points_m) + T[:, :3, 3])
 
 
 @dataclass(frozen=True, eq=False)
