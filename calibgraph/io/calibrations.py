@@ -133,7 +133,7 @@ class _Parts(BaseModel):
     weaknesses: dict[str, tuple[str, ...]]
     frames_used: tuple[_FrameEntry, ...]
     moves: tuple[str, ...] = ()
-    knows_motion: bool = False
+    motion: str = ""
     places: tuple[tuple[int, ...], ...] = ()
     rounds: tuple[dict[str, Any], ...]
     warnings: tuple[str, ...] = ()

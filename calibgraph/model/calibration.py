@@ -21,7 +21,7 @@ from calibgraph.files import sha256, write_yaml, written_together
 from calibgraph.model import geometry, result_files
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.config import Config, Terms
-from calibgraph.model.correspondences import Correspondences
+from calibgraph.model.correspondences import TWISTS, Correspondences
 from calibgraph.model.error_sources import ErrorSources
 from calibgraph.model.lens import LensEstimate, joint_parameters
 from calibgraph.model.places import Groups
@@ -124,7 +124,8 @@ class Calibration:
         frames: of ``calibrate``: per frame its ``frame`` number, ``name``, ``cloud`` file, and
             ``images``, a file per camera.
         moves: of ``track``: what moved, since when, how far, in words.
-        knows_motion: of ``track``: whether its frames have the motion of the LiDAR.
+        motion: of ``track``: the column of its frames that has the motion of the LiDAR, or times of
+            points, ``Correspondences.motion_column``.
         places: frame numbers of each place; empty if nobody looked for places, and of ``track``.
         rounds: of ``calibrate``: per round and camera, the matches and how far it moved.
         warnings: of ``calibrate``: about the dataset, its guess, and a lens that did not settle.
@@ -155,7 +156,7 @@ class Calibration:
     lens_covariance: dict[str, Array] = field(default_factory=dict)
     frames: tuple[dict[str, Any], ...] = ()
     moves: tuple[str, ...] = ()
-    knows_motion: bool = False
+    motion: str = ""
     places: Groups = ()
     rounds: tuple[Mapping[str, Any], ...] = ()
     warnings: tuple[str, ...] = ()
@@ -272,12 +273,11 @@ class Calibration:
         Without either, clouds count as corrected for it.
         """
         table, estimated = self.correspondences, {*self.config.estimate}
-        moves = self.knows_motion if table is None else table.twist_per_s is not None
-        timed = moves or (table is not None and table.late_s is not None)
+        motion = self.motion if table is None else table.motion_column
         free = self.lens and estimated - {"offset", "readout"}
         lens = "other intrinsics" if free else "intrinsics"
-        others = [] if moves or "offset" in estimated else ["time offset"]
-        others += [] if timed else ["motion during a scan"]
+        others = [] if motion == TWISTS or "offset" in estimated else ["time offset"]
+        others += [] if motion else ["motion during a scan"]
         others += [] if self.rig.relative_poses else ["range scale"]
         return ", ".join([f"{lens} beyond what the rig states", *others])
 
@@ -357,7 +357,7 @@ _KEYS = (
     "covariance_of", "covariance", "joint_names", "joint_covariance", "pair_covariance_of",
     "pair_covariance",
     "lens", "lens_covariance", "residuals", "counts", "frames_used",
-    "moves", "knows_motion", "places", "rounds", "warnings", "initial_rig",
+    "moves", "motion", "places", "rounds", "warnings", "initial_rig",
     "stage1_T_camera_lidar", "terms", "config", "timings_s", "inputs", "versions", "date",
 )  # fmt: skip
 """Of the file, in its order; those that are no attributes are made for it."""

@@ -27,7 +27,8 @@ TABLE_FORMAT = "calibgraph-correspondences/1"
 COORDINATES = ("u_px", "v_px", "x_m", "y_m", "z_m")
 INFORMATION = ("i_uu_px", "i_uv_px", "i_vv_px")
 TWIST = ("wx_rad_s", "wy_rad_s", "wz_rad_s", "vx_m_s", "vy_m_s", "vz_m_s")
-LATE, MAX_LATE_S = "late_s", 10.0  # of no image and cloud that belong together
+TWISTS, LATE = "twist_per_s", "late_s"
+MAX_LATE_S = 10.0  # of no image and cloud that belong together
 MAX_TWIST = 6.0, 100.0  # rad/s and m/s: beyond those of a vehicle; swapped ones are seen
 TWIST_RULE = "be under 6 rad/s, then under 100 m/s (rotation first, in radians)"
 
@@ -208,6 +209,11 @@ class Correspondences(Table):
         """The rows of all other cameras."""
         left_out = [number for number, name in enumerate(self.cameras) if name in names]
         return self.select(~np.isin(self.camera_index, left_out)) if left_out else self
+
+    @property
+    def motion_column(self) -> str:
+        """``twist_per_s``, if it has the motion of the LiDAR; else ``late_s`` or nothing."""
+        return TWISTS if self.twist_per_s is not None else "" if self.late_s is None else LATE
 
     @property
     def is_swept(self) -> bool:

@@ -143,14 +143,21 @@ def travel_errors(at: FittedObjective) -> Array:
     """
     found = np.zeros((len(at.cameras), 6, len(_TRAVEL)))
     for name, block in at.projections.items():
-        if block.motion is None or block.motion[:, :6].any():
-            continue  # of one instant, or moved to the time of the pixels
-        shift, T = Columns(block.lens, (OFFSET,), (1.0,)), at.T_camera_lidar[name][None]
-        for column, twist in zip(found[at.cameras.index(name)].T, _TRAVEL, strict=True):
-            of_unit = np.column_stack([np.outer(block.motion[:, 6], twist), np.zeros(len(block))])
-            hessian = replace(block, motion=of_unit).summarize(T, None, shift).hessian[0]
-            column[:] = np.linalg.solve(hessian[:6, :6] + WEAK, hessian[:6, 6])
+        found[at.cameras.index(name)] = error_by_travel(block, at.T_camera_lidar[name])
     return found.reshape(-1, len(_TRAVEL))
+
+
+def error_by_travel(block: ProjectionBlock, T_camera_lidar: Array) -> Array:
+    """(6, 3) of one pose, as :func:`travel_errors`; zero of points that are as of their pixels."""
+    found = np.zeros((6, len(_TRAVEL)))
+    if block.motion is None or block.motion[:, :6].any():
+        return found  # of one instant, or moved to the time of the pixels
+    shift, T = Columns(block.lens, (OFFSET,), (1.0,)), T_camera_lidar[None]
+    for column, twist in zip(found.T, _TRAVEL, strict=True):
+        of_unit = np.column_stack([np.outer(block.motion[:, 6], twist), np.zeros(len(block))])
+        hessian = replace(block, motion=of_unit).summarize(T, None, shift).hessian[0]
+        column[:] = np.linalg.solve(hessian[:6, :6] + WEAK, hessian[:6, 6])
+    return found
 
 
 def considered_lens(camera: Camera, block: ProjectionBlock) -> LensVariable:

@@ -13,7 +13,7 @@ from calibgraph.model.geometry import invert
 from calibgraph.model.rig import Rig
 from calibgraph.pipeline import solve
 from calibgraph.solver.columns import distortion_evidence
-from calibgraph.solver.lens import considered_lens, error_by_lens, lens_columns
+from calibgraph.solver.lens import considered_lens, error_by_lens, error_by_travel, lens_columns
 from calibgraph.solver.matches import CameraBlock, camera_blocks
 from calibgraph.solver.pnp import frame_pose
 from calibgraph.solver.preprocess import preprocess
@@ -42,7 +42,7 @@ def begin_frames(state: State, frames: Sequence[StreamFrame]) -> None:
     state.stamp_ns = last.stamp_ns
     state.updates += len(frames)
     for table in tables:
-        state.knows_motion = table.twist_per_s is not None
+        state.motion = table.motion_column
         if table.findings != state.findings:
             new = findings_of(table.findings)
             state.findings = state.findings if new == state.findings else new
@@ -322,7 +322,7 @@ def _consider_lens(state: State, camera: int, matches: CameraBlock) -> Array:
     errors = np.zeros((6, 6)) if found is None else found
     if (known := state.lens_errors[camera]).any():
         errors = _LENS_KEPT * known + (1 - _LENS_KEPT) * errors
-    state.put(camera, lens_errors=errors)
+    state.put(camera, lens_errors=errors, travel=error_by_travel(seen.block, T))
     return columns
 
 

@@ -138,7 +138,7 @@ def to_calibration(state: State, estimate: Estimate) -> Calibration:
         terms="full",
         config=state.config,
         moves=tuple(map(str, state.moves)),
-        knows_motion=bool(state.knows_motion),
+        motion=state.motion or "",
     )
 
 

@@ -330,7 +330,8 @@ class EpochGraph:
         T, covariance = self.window.reported(state.config.of)
         if state.config.preset != "auto":
             T = retract_all(state.references, self.equation_5(sums))
-        covariance = covariance + block_diagonal(state.lens_errors)
+        travel = state.travel.reshape(len(covariance), -1)
+        covariance = covariance + block_diagonal(state.lens_errors) + travel @ travel.T
         few = np.repeat(sums.frames < ENOUGH_FRAMES, 6)
         covariance[few], covariance[:, few] = np.nan, np.nan
         return Estimate(T, covariance, sums, self._conflicts(state, sums), self.window)

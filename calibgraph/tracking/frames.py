@@ -34,6 +34,7 @@ from calibgraph.model.clock import OF_IMAGES, OF_TABLES, unused_times
 from calibgraph.model.correspondences import (
     COORDINATES,
     INFORMATION,
+    TWISTS,
     Correspondences,
     as_confidence,
 )
@@ -135,6 +136,7 @@ class CameraColumns(BaseModel):
     i_uu_px: list[float] = []
     i_uv_px: list[float] = []
     i_vv_px: list[float] = []
+    late_s: list[float] = []
 
     @model_validator(mode="after")
     def _require_whole_table(self) -> Self:
@@ -182,7 +184,7 @@ class FrameLine(BaseModel):
 
         coordinates = columns(**dict.fromkeys(COORDINATES, np.nan))
         coordinates = np.zeros((0, 5)) if coordinates is None else coordinates
-        confidence = columns(confidence=1.0)
+        confidence, late = columns(confidence=1.0), columns(late_s=0.0)
         table = Correspondences(
             cameras=tuple(self.cameras),
             camera_index=np.repeat(np.arange(len(cameras), dtype=np.int32), counts),
@@ -193,6 +195,7 @@ class FrameLine(BaseModel):
             information_px=columns(**dict(zip(INFORMATION, (1.0, 0.0, 1.0), strict=True))),
             stamp_ns=None if self.stamp_ns is None else np.full(n, self.stamp_ns),
             twist_per_s=np.tile(self.twist_per_s, (n, 1)) if self.twist_per_s and n else None,
+            late_s=None if late is None else late[:, 0],
             metadata=self.metadata,
         )
         return StreamFrame(self.frame, table, self.stamp_ns, self.place)
@@ -307,16 +310,16 @@ def _place_of(frame: StreamFrame) -> str:
 
 
 def _require_same_motion(state: State, table: Correspondences) -> None:
-    """Refuse a frame that has the motion of the LiDAR where earlier ones do not, or has none."""
-    known, before = table.twist_per_s is not None, state.knows_motion
-    if before is not None and before != known:
-        found, earlier = ("no ", "one") if not known else ("a ", "none")
+    """Refuse a frame with the motion of the LiDAR, or times of points, where others have none."""
+    found, before = table.motion_column, state.motion
+    if before is not None and before != found:
+        one, other = (name or "neither motion nor times of points" for name in (found, before))
         raise CorrespondenceError(
-            f"it has {found}motion of the LiDAR (twist_per_s), earlier frames have {earlier}; "
-            "clocks need it with every frame: give it or leave it out"
+            f"it has {one}, earlier frames have {other}; error bars need the same of every frame: "
+            f"give {before or found} with all, or with none"
         )
     if before is None:
-        unused_times(state.rig, is_known=known, how=f"{OF_IMAGES}, {OF_TABLES}")
+        unused_times(state.rig, is_known=found == TWISTS, how=f"{OF_IMAGES}, {OF_TABLES}")
 
 
 def repeated_cameras(state: State, table: Correspondences) -> list[int]:

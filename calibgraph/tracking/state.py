@@ -90,6 +90,7 @@ class State:
         groups: (n, 2) number of epochs, and how much these scatter.
         lens: (6, 6 + k) per camera, of closed epochs, by ``calibgraph.solver.lens.lens_columns``.
         lens_errors: (n, 6, 6) covariance of its pose by what may err of its lens.
+        travel: (n, 6, 3) of its pose by an unknown motion, by ``solver.lens.error_by_travel``.
         curvature: (n, 6, 6) M of :meth:`calibgraph.tracking.gate.Gated.curvature`.
         total: sum over all absorbed frames, slowly forgotten: (6 n, 6 n) scatter.
         total_hessian: (n, 6, 6) and of Hessians.
@@ -113,7 +114,8 @@ class State:
         stamp_ns: time of the last frame, or None.
         updates: number of updates.
         moves: the last events of moves and drifts.
-        knows_motion: whether the motion of frames is known; None before the first.
+        motion: the column of frames with the motion of the LiDAR, ``twist_per_s``, or with times of
+            points, ``late_s``; empty if they have neither, None before the first.
     """
 
     rig: Rig
@@ -136,6 +138,7 @@ class State:
     groups: Array
     lens: tuple[Array, ...]
     lens_errors: Array
+    travel: Array
     curvature: Array
     total: Array
     total_hessian: Array
@@ -159,7 +162,7 @@ class State:
     stamp_ns: int | None = None
     updates: int = 0
     moves: tuple[Event, ...] = ()
-    knows_motion: bool | None = None
+    motion: str | None = None
 
     @staticmethod
     def initial(rig: Rig, config: Config) -> State:
@@ -193,6 +196,7 @@ class State:
             groups=np.zeros((n, 2)),
             lens=(np.zeros((6, 6)),) * n,
             lens_errors=np.zeros((n, 6, 6)),
+            travel=np.zeros((n, 6, 3)),
             curvature=np.tile(np.eye(6), (n, 1, 1)),
             total=np.zeros((6 * n, 6 * n)),
             total_hessian=np.zeros((n, 6, 6)),

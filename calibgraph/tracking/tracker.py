@@ -271,7 +271,7 @@ class IncrementalCalibrator:
 
 
 def _columns(table: Correspondences) -> tuple[object, ...]:
-    optional = table.information_px, table.twist_per_s
+    optional = table.information_px, table.twist_per_s, table.late_s
     return len(table) > 0, table.findings, *(column is None for column in optional)
 
 

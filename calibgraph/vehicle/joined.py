@@ -85,7 +85,7 @@ def join_clouds(
     seen = ", ".join(f"{name} {share:.0%}" for name, share in poor.items())
     line = f"clouds of {rig.lidar}, {', '.join(joined)} are joined for cameras, since {rig.lidar} "
     line += f"alone shows of what all show: {seen}"
-    return replace(data, frames=frames, recorded=()), line
+    return replace(data, frames=frames), line
 
 
 def place_by_cameras(
@@ -102,48 +102,69 @@ def place_by_cameras(
     Raises:
         CalibrationError: if no camera has been found in the clouds of both.
     """
-    T_guess, alone = (
-        rig.T_base_lidar[name],
-        rig.model_copy(update={"lidars": None, "vehicle": None}),
-    )
-    own = replace(data, frames=tuple(_of_lidar(f, name, T_guess) for f in data.frames), recorded=())
+    T_guess = rig.T_base_lidar[name]
+    alone = rig.model_copy(update={"lidars": None, "vehicle": None})
     at_other = alone.moved_to({n: T @ T_guess for n, T in alone.T_camera_lidar.items()})
-    sides = [(replace(data, frames=tuple(replace(f, lidar_paths={}) for f in data.frames)), alone)]
-    sides += [(own, at_other)]
+    sides = [
+        (_with_frames(data, name, lambda frame: replace(frame, lidar_paths={})), alone),
+        (_with_frames(data, name, lambda frame: _of_lidar(frame, name, T_guess)), at_other),
+    ]
     both = [_cameras_in(side, of) for side, of in sides]
     seen = [camera for camera in rig.cameras if all(camera in of for of in both)]
     if not seen:
         raise CalibrationError(f"no camera sees what {rig.lidar} and {name} see")
     base, other = (calibrate(side, _with_cameras(of, seen)) for side, of in sides)
-    found = [n for n in seen if "FAIL" not in (base.verdicts[n].status, other.verdicts[n].status)]
-    if not found or base.joint_covariance is None or other.joint_covariance is None:
+    found = [n for n in seen if all(_is_found(side, n) for side in (base, other))]
+    if not found:
         raise CalibrationError(
             f"{rig.lidar} and {name} share no planes, and of the cameras that see what both see "
             f"({', '.join(seen)}) none is calibrated to both"
         )
-    T = [invert(base.rig.T_camera_lidar[n]) @ other.rig.T_camera_lidar[n] for n in found]
-    rows = np.concatenate([np.r_[pose_rows(seen.index(n))] for n in found])
-    to_base = block_diag(*adjoints(invert(np.array([base.rig.T_camera_lidar[n] for n in found]))))
-    covariance = (base.joint_covariance + other.joint_covariance)[np.ix_(rows, rows)]
-    weight = np.linalg.inv(to_base @ covariance @ to_base.T)
-    mean, apart = (
-        np.tile(np.eye(6), (len(found), 1)),
-        np.concatenate([twist_between(each, T[0]) for each in T]),
-    )
-    own_covariance = np.linalg.inv(mean.T @ weight @ mean)
-    step = own_covariance @ mean.T @ weight @ apart
-    left = apart - mean @ step
-    ratio = max(1.0, float(left @ weight @ left) / max(6 * (len(found) - 1), 1))
-    T_base_lidar = retract_all(T[0][None], -step[None])[0]
+    T_lidar_camera = invert(np.array([base.rig.T_camera_lidar[n] for n in found]))
+    T = T_lidar_camera @ [other.rig.T_camera_lidar[n] for n in found]
+    to_base = block_diag(*adjoints(T_lidar_camera))
+    covariance = to_base @ (_joint(base, found) + _joint(other, found)) @ to_base.T
+    T_base_lidar, own, ratio = _mean_pose(T, covariance)
     turn = np.linalg.inv(_turn_at(T_base_lidar))
-    return LidarPoses(
-        rig.lidar,
-        {rig.lidar: np.eye(4), name: T_base_lidar},
-        turn @ own_covariance @ turn.T * ratio,
-        {},
-        len(data.frames),
-        (ratio, ratio),
+    poses, joint = {rig.lidar: np.eye(4), name: T_base_lidar}, turn @ own @ turn.T
+    return LidarPoses(rig.lidar, poses, joint, {}, len(data.frames), (ratio, ratio))
+
+
+def _with_frames(data: Dataset, name: str, make: Callable[[Frame], Frame]) -> Dataset:
+    """The dataset with each frame that has a LiDAR's cloud made another."""
+    frames, recorded = (
+        tuple(make(frame) for frame in of if name in frame.lidar_paths)
+        for of in (data.frames, data.recorded)
     )
+    return replace(data, frames=frames, recorded=recorded)
+
+
+def _is_found(result: Calibration, camera: str) -> bool:
+    return result.covariance[camera] is not None and result.verdicts[camera].status != "FAIL"
+
+
+def _joint(result: Calibration, cameras: Sequence[str]) -> Array:
+    """(6 n, 6 n) of some cameras; as independent where another one is not determined."""
+    if result.joint_covariance is None:
+        return np.asarray(block_diag(*(result.covariance[name] for name in cameras)))
+    names = [*result.rig.cameras]
+    rows = np.concatenate([np.r_[pose_rows(names.index(name))] for name in cameras])
+    return np.asarray(result.joint_covariance[np.ix_(rows, rows)])
+
+
+def _mean_pose(T: Array, covariance: Array) -> tuple[Array, Array, float]:
+    """(4, 4) the mean of (n, 4, 4) estimates of one pose, its (6, 6) covariance, and a ratio.
+
+    By the (6 n, 6 n) covariance of xi in exp(xi) T. The ratio is that by which their scatter is
+    wider than it says, at least 1, and the covariance is wider by it.
+    """
+    weight, each = np.linalg.inv(covariance), np.tile(np.eye(6), (len(T), 1))
+    apart = np.concatenate([twist_between(one, T[0]) for one in T])
+    own = np.linalg.inv(each.T @ weight @ each)
+    step = own @ each.T @ weight @ apart
+    left = apart - each @ step
+    ratio = max(1.0, float(left @ weight @ left) / max(6 * (len(T) - 1), 1))
+    return np.asarray(retract_all(T[:1], -step[None])[0]), np.asarray(ratio * own), ratio
 
 
 def _of_lidar(frame: Frame, name: str, T_base_lidar: Array) -> Frame:

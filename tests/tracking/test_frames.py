@@ -84,7 +84,7 @@ def test_a_table_gives_its_frames_in_ascending_order(suffix: str, tmp_path: Path
 
 def test_a_json_line_is_a_frame() -> None:
     left = camera(2, confidence=[0.5, 1], u_px=[1, 2])
-    right = camera(1, i_uu_px=[2], i_uv_px=[0.5], i_vv_px=[1])
+    right = camera(1, i_uu_px=[2], i_uv_px=[0.5], i_vv_px=[1], late_s=[0.03])
     (item,) = of_bytes(
         line(cameras={"right": right, "left": left}, stamp_ns=2**62, metadata={"matcher": "m"})
     )
@@ -98,6 +98,7 @@ def test_a_json_line_is_a_frame() -> None:
     assert left_rows.information_px.tolist() == [[1, 0, 1]] * 2
     assert right_rows.information_px.tolist() == [[2, 0.5, 1]]
     assert right_rows.confidence.tolist() == [1]
+    assert (left_rows.late_s.tolist(), right_rows.late_s.tolist()) == ([0, 0], [0.03])
 
 
 @pytest.mark.parametrize("cameras", [{}, {"left": camera(0)}])

@@ -77,23 +77,34 @@ def test_a_static_rig_gives_what_a_batch_gives(mixed_rig: Rig) -> None:
     assert not events_of(updates)
 
 
-def test_where_the_motion_is_known_the_clock_may_err_as_in_a_batch(tmp_path: Path) -> None:
-    """5 ms at 10 m/s are 5 cm ahead, the third axis of a camera that looks there."""
+def test_clocks_and_swept_clouds_widen_the_bars_as_in_a_batch(tmp_path: Path) -> None:
+    """5 ms at 10 m/s, or points 8 ms late at an unknown speed, are 5 or 8 cm ahead.
+
+    That is the third axis of a camera that looks there.
+    """
     rig = with_known_lenses(rig_of("kitti"))
     still = simulate_correspondences(rig, frames=30, matches=100, errors=ERRORS, seed=1)
     drives = replace(still, twist_per_s=np.tile([0, 0, 0, 10.0, 0, 0], (len(still), 1)))
-    ahead_cm = []
-    for table in (still, drives):
+    swept = replace(still, late_s=np.full(len(still), 0.008))
+    ahead_cm, left_out = [], []
+    for table in (still, drives, swept):
         tables = [table.select(table.frame == frame) for frame in range(30)]
         tracker, updates = tracked(rig, tables)
         batch, found = solve(rig, table).covariance, updates[-1].covariance
         ahead_cm.append([100 * np.sqrt(each["image_2"][5, 5]) for each in (found, batch)])
         kept = load_calibration(tracker.calibration().save(tmp_path))
-        assert ("time offset" in kept.not_included) == (table is still)
-    (alone, _), (whole, in_batch) = ahead_cm
-    assert whole == pytest.approx(np.hypot(alone, 5.0), rel=0.1)
-    assert whole == pytest.approx(in_batch, rel=0.1)
-    with pytest.raises(CorrespondenceError, match="no motion of the LiDAR .* clocks need it"):
+        left_out.append(
+            [what in kept.not_included for what in ("time offset", "motion during a scan")]
+        )
+        assert kept.motion == table.motion_column
+    (alone, _), *wider = ahead_cm
+    for (whole, in_batch), by_motion in zip(wider, (5.0, 8.0), strict=True):
+        assert whole == pytest.approx(np.hypot(alone, by_motion), rel=0.1)
+        assert whole == pytest.approx(in_batch, rel=0.1)
+    assert left_out == [[True, True], [False, False], [True, False]]
+    with pytest.raises(
+        CorrespondenceError, match="has neither motion .* earlier frames have late_s"
+    ):
         tracker.update(replace(still.select(still.frame == 29), frame=np.full(200, 30)))
 
 
