@@ -25,13 +25,11 @@ def aggregate(T_camera_lidar: Array, how: str) -> Array:
     translations = T_camera_lidar[:, :3, 3]
     if how == "mean":
         return transform(rotations.mean(), translations.mean(axis=0))
-    if how == "mode":
-        median = Rotation.from_matrix(median_pose(T_camera_lidar)[:3, :3])
-        tangents = (rotations * median.inv()).as_rotvec()
-        mode = np.array([half_sample_mode(column) for column in tangents.T])
-        translation = [half_sample_mode(column) for column in translations.T]
-        return transform(Rotation.from_rotvec(mode) * median, translation)
-    raise ValueError(f"unknown aggregate {how!r}; known are median, mean, mode")
+    median = Rotation.from_matrix(median_pose(T_camera_lidar)[:3, :3])
+    tangents = (rotations * median.inv()).as_rotvec()
+    mode = np.array([half_sample_mode(column) for column in tangents.T])
+    translation = [half_sample_mode(column) for column in translations.T]
+    return transform(Rotation.from_rotvec(mode) * median, translation)
 
 
 def half_sample_mode(samples: Sequence[float] | Array) -> float:
