@@ -11,16 +11,17 @@ starts from. With ``cmrnext`` and with tables of correspondences, Stage 1 is the
 
 import logging
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from calibgraph.arrays import Array
 from calibgraph.elsewhere import go_on_elsewhere
 from calibgraph.io.clouds import describe_thinned
 from calibgraph.io.dataset import Dataset, load_dataset
 from calibgraph.io.tables import load_correspondences
+from calibgraph.matching.named import find_matcher
 from calibgraph.model.calibration import Calibration, Later
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.clock import odd_motions, unused_times
@@ -39,6 +40,12 @@ from calibgraph.trust.inputs import registered_twists
 from calibgraph.trust.lens_checks import asks_offset
 from calibgraph.trust.probability import STRUCTURE, TABLES, judge
 from calibgraph.trust.solution_checks import residuals_of, weaknesses
+from calibgraph.vehicle.joined import (
+    JoinedMatcher,
+    join_clouds,
+    joint_covariance,
+    place_by_cameras,
+)
 from calibgraph.vehicle.rig import LidarResult, calibrate_rig_lidars
 
 _log = logging.getLogger(__name__)
@@ -57,7 +64,8 @@ def calibrate(
 ) -> Calibration:
     """Calibrate all cameras of a rig jointly from images and clouds, and its LiDARs from clouds.
 
-    Of several LiDARs each is calibrated to the base, and cameras to the base alone.
+    Of several LiDARs each is calibrated to the base. Cameras of which the base sees too little are
+    matched with the clouds of all LiDARs.
 
     Args:
         dataset: a dataset, its folder, a KITTI odometry sequence, or several folders of one rig.
@@ -79,19 +87,29 @@ def calibrate(
     report, watch = progress or no_progress, Stopwatch()
     data = dataset if isinstance(dataset, Dataset) else load_dataset(dataset, rig)
     rig, lidars = (rig if rig and data is dataset else data.rig), None
+    config, joined = config or Config(), ""
     if rig.other_lidars:
         with watch("lidars"):
-            lidars = calibrate_rig_lidars(data, rig, config or Config(), progress=report)
+
+            def alone(data: Dataset, rig: Rig) -> Calibration:
+                return calibrate(data, rig, matcher, config, terms=terms, progress=progress)
+
+            place = partial(place_by_cameras, alone, data, rig) if rig.cameras else None
+            lidars = calibrate_rig_lidars(data, rig, config, place=place, progress=report)
+            data, joined = join_clouds(data, rig, lidars.poses, config.tolerance)
+        if joined:
+            _log.info(joined)
+            matcher = JoinedMatcher(find_matcher(matcher, seed=config.seed), lidars.poses)
     if lidars is not None and not rig.cameras:
         with watch("hash_inputs"):
             hashes = hash_inputs(data)
         result = replace(
-            _without_cameras(rig, config or Config(), terms),
+            _without_cameras(rig, config, terms),
             inputs=hashes,
             frames=tuple(frame.entry() for frame in data.frames),
             timings_s=watch.seconds,
         )
-        return _with_lidars(result, lidars)
+        return _with_lidars(result, lidars, np.empty((0, 0)), "")
     with Threads(1) as beside:
         run = match_in_rounds(                                   # match -> solve_joint, in rounds
             data, rig, matcher, config, terms=terms, time_limit_s=time_limit_s, progress=report
@@ -119,7 +137,9 @@ def calibrate(
         inputs=dict(run.hashes),
         timings_s={**watch.seconds, **run.watch.seconds},
     )
-    return result if lidars is None else _with_lidars(result, lidars)
+    return (
+        result if lidars is None else _with_lidars(result, lidars, run.solution.by_lidars, joined)
+    )
 
 
 def _without_cameras(rig: Rig, config: Config, terms: Terms) -> Calibration:
@@ -130,11 +150,13 @@ def _without_cameras(rig: Rig, config: Config, terms: Terms) -> Calibration:
     )  # fmt: skip
 
 
-def _with_lidars(result: Calibration, found: LidarResult) -> Calibration:
-    """The result with the LiDARs beside the cameras, of which they are independent."""
+def _with_lidars(
+    result: Calibration, found: LidarResult, by_lidars: Array, joined: str
+) -> Calibration:
+    """The result with the LiDARs beside the cameras, and in one covariance with them."""
     cameras, joint = result.joint_covariance, None
     if cameras is not None:
-        joint = np.asarray(block_diag(cameras, found.poses.joint_covariance))
+        joint = joint_covariance(cameras, by_lidars, found.poses)
     T, bars = found.poses.T_base_lidar, found.poses.covariance
     lidars = {
         name: Lidar(T_base_lidar=T[name], covariance=bars[name]) if name in bars else Lidar()
@@ -145,7 +167,7 @@ def _with_lidars(result: Calibration, found: LidarResult) -> Calibration:
         rig=result.rig.model_copy(update={"lidars": lidars, "vehicle": found.vehicle}),
         joint_covariance=joint,
         lidar_verdicts=dict(found.verdicts),
-        warnings=(*result.warnings, *found.warnings),
+        warnings=(*result.warnings, *found.warnings, *filter(None, [joined])),
     )
 
 

@@ -42,6 +42,7 @@ from calibgraph.trust.probability import STRUCTURE, judge
 from factors import Clock, displace
 from tests.conftest import SAMPLE, require_near, require_poses
 from tests.draws.clocks import draw_twists
+from tests.draws.lenses import put_lens_error
 from tests.matching.structure.data import with_noise_images
 
 
@@ -238,10 +239,7 @@ def test_cameras_are_matched_through_the_lenses_that_were_estimated(
     data: Dataset, truth: Rig
 ) -> None:
     """With a focal length 2 % too long, matches had agreed on a pair that is 7 cm off."""
-    camera = truth.cameras[PAIR[0]]
-    lens = camera.intrinsics_px
-    longer = lens.model_copy(update={"fx": 1.02 * lens.fx, "fy": 1.02 * lens.fy})
-    wrong = camera.model_copy(update={"intrinsics_px": longer})
+    wrong = put_lens_error(truth, "focal", 0.02).cameras[PAIR[0]]
     guess = truth.model_copy(update={"cameras": {**truth.cameras, PAIR[0]: wrong}})
     config = Config(estimate=("focal",))
     run = match_in_rounds(data, guess, table_of(truth), config, progress=no_progress)

@@ -27,7 +27,7 @@ from benchmarks.tables import ROOT, Table
 from calibgraph import Calibration, Config, Dataset, Rig, calibrate, load_dataset, perturb
 from calibgraph.model.rig import Camera
 from factors.columns import COEFFICIENT_NUMBERS
-from tests.draws.lenses import put_lens_error
+from tests.draws.lenses import put_lens_error, with_fields
 from tools.scenes.rolling_drives import WRONG, draw_wrong, load_drive, truth_of
 
 KITTI = ("05", "06", "07", "08", "06+07+08")
@@ -85,9 +85,8 @@ def _load(case: Key, folders: Folders, scenes: Path) -> tuple[Dataset, Rig, Rig]
     later = int(case.kind.split()[0])
     pairs = zip(data.frames[: len(data.frames) - later], data.frames[later:], strict=True)
     frames = tuple(replace(one, image_paths=other.image_paths) for one, other in pairs)
-    data, late = replace(data, frames=frames), {"time_offset_s": later * INTERVAL_S}
-    cameras = {name: camera.model_copy(update=late) for name, camera in truth.cameras.items()}
-    return data, truth.model_copy(update={"cameras": cameras}), truth
+    late = with_fields(truth, time_offset_s=later * INTERVAL_S)
+    return replace(data, frames=frames), late, truth
 
 
 def _wrong_rig(truth: Rig, seed: int) -> Rig:
@@ -96,9 +95,7 @@ def _wrong_rig(truth: Rig, seed: int) -> Rig:
     for part in ("focal", "centre", "distortion"):
         if part in wrong:
             rig = put_lens_error(rig, part, wrong[part])  # type: ignore[arg-type]
-    times = {"time_offset_s": None, "readout_s": None}
-    cameras = {name: camera.model_copy(update=times) for name, camera in rig.cameras.items()}
-    return rig.model_copy(update={"cameras": cameras})
+    return with_fields(rig, time_offset_s=None, readout_s=None)
 
 
 def values_of(camera: Camera) -> dict[str, float]:

@@ -99,6 +99,8 @@ class _FrameEntry(BaseModel):
     name: str
     cloud: str
     images: dict[str, str]
+    lidars: dict[str, str] | None = None
+    joined: dict[str, tuple[tuple[Finite, ...], ...]] | None = None
     motion: _Motion | None = None
     cloud_columns: tuple[str, ...] | None = None
 
@@ -131,6 +133,7 @@ class _Parts(BaseModel):
     weaknesses: dict[str, tuple[str, ...]]
     frames_used: tuple[_FrameEntry, ...]
     moves: tuple[str, ...] = ()
+    knows_motion: bool = False
     places: tuple[tuple[int, ...], ...] = ()
     rounds: tuple[dict[str, Any], ...]
     warnings: tuple[str, ...] = ()

@@ -37,7 +37,7 @@ from calibgraph.io.clouds import (
 from calibgraph.io.frame_files import stamp_ns_in_name
 from calibgraph.io.images import BurntIn, load_image, require_size
 from calibgraph.memory import mmap_copy
-from calibgraph.model.geometry import invert
+from calibgraph.model.geometry import invert, move_points
 from calibgraph.model.rig import Camera
 from calibgraph.parallel import KeyedCache
 from factors import displace
@@ -134,6 +134,7 @@ class Frame:
         images_after_s: per camera, by how much its image is after the stamp, where no names of
             files state it.
         columns: names of those of a .bin cloud, if the rig states them.
+        joined: (4, 4) T_base_lidar of other LiDARs, whose clouds are a part of this one's.
         arrays: the cloud and images by their paths, which are names, if they are in memory.
         kept: gray images, the cloud and what derives of them, which may then not be written to.
 
@@ -153,6 +154,7 @@ class Frame:
     recorded_ns: int | None = field(default=None, kw_only=True)
     images_after_s: Mapping[str, float] = field(default_factory=dict, kw_only=True, compare=False)
     columns: tuple[str, ...] | None = field(default=None, kw_only=True)
+    joined: Mapping[str, Array] = field(default_factory=dict, kw_only=True, compare=False)
     arrays: Mapping[Path, NDArray[Any]] = field(
         default_factory=dict, kw_only=True, compare=False, repr=False
     )
@@ -203,34 +205,70 @@ class Frame:
             found = with_intensity(cloud)
         else:
             found = self.arrays[path] if path in self.arrays else load_cloud(path, self.columns)
-            if motion is not None and (sweep := self.load_sweep()) is not None:
+            if motion is not None and (sweep := self._sweep_of("")) is not None:
                 found[:, :3] = motion.correct(*sweep)
-        return thin_cloud(found)
+        return thin_cloud(self._join(found) if self.joined else found)
+
+    def load_in_base(self, lidar: str) -> NDArray[np.float32] | None:
+        """(n, 4) the cloud of a joined LiDAR in the frame of the base, corrected as its cloud is.
+
+        None where the vehicle is known to move, and its points have no times.
+        """
+        motion = self.motion
+        cloud, times_s = self._load_returns(lidar, timed=motion is not None)
+        points = move_points(cloud[:, :3].astype(np.float64), self.joined[lidar])
+        if motion is not None:
+            if times_s is None:
+                return None
+            points = motion.correct(points, times_s)
+        return np.column_stack([points, cloud[:, 3]]).astype(np.float32)
+
+    def _join(self, base: NDArray[np.float32]) -> NDArray[np.float32]:
+        """The base's cloud and those of others, each with the ranks of its own intensities."""
+        parts = [base, *(of for n in self.joined if (of := self.load_in_base(n)) is not None)]
+        for part in parts:
+            ordered, own = np.sort(part[:, 3]), part[:, 3].copy()
+            part[:, 3] = np.searchsorted(ordered, own) + np.searchsorted(ordered, own, "right")
+            part[:, 3] /= 2 * max(len(part), 1)
+        return np.concatenate(parts)
 
     def load_recorded(self, lidar: str, *, timed: bool) -> tuple[Array, Array | None]:
         """(n, 3) the cloud of one of several LiDARs, as it was recorded, in its own frame.
 
         And, if asked, (n,) the times of its points [s] after the frame's stamp; None without.
         """
+        cloud, times_s = self._load_returns(lidar, timed=timed)
+        return cloud[:, :3].astype(np.float64), times_s
+
+    def _load_returns(self, lidar: str, *, timed: bool) -> tuple[NDArray[np.float32], Array | None]:
         path, times_s = self.lidar_paths.get(lidar, self.cloud_path), None
         if path.suffix == MESSAGE_SUFFIX:
-            cloud, times_s = load_bag_cloud(path, timed=timed, start_ns=self.stamp_ns)
-        else:
-            found = read_returns(path, self.columns if path == self.cloud_path else None)
-            cloud = found.points
-            if timed and found.times is not None:
-                times_s = seconds_after(self.stamp_ns, found.times, str(path))
-        return cloud[:, :3].astype(np.float64), times_s
+            return load_bag_cloud(path, timed=timed, start_ns=self.stamp_ns)
+        found = read_returns(path, self.columns if path == self.cloud_path else None)
+        if timed and found.times is not None:
+            times_s = seconds_after(self.stamp_ns, found.times, str(path))
+        return with_intensity(found.points), times_s
 
     def load_sweep(self) -> tuple[Array, Array] | None:
         """(n, 3) the points as recorded, and (n,) their times [s] after the stamp; None without.
 
-        Times that are all equal, or of no scan, are none.
+        Times that are all equal, or of no scan, are none. Joined clouds are a part.
         """
+        own = self._sweep_of("")
+        if own is None or not self.joined:
+            return own
+        others = {name: self._sweep_of(name) for name in self.joined}
+        parts = [
+            (move_points(of[0], self.joined[name]), of[1]) for name, of in others.items() if of
+        ]
+        points, times_s = zip(own, *parts, strict=True)
+        return np.concatenate(points), np.concatenate(times_s)
+
+    def _sweep_of(self, lidar: str) -> tuple[Array, Array] | None:
         if self.cloud_path in self.arrays:
             return None
         with suppress(DatasetError):  # numbers that are no times of one scan
-            points, times_s = self.load_recorded("", timed=True)
+            points, times_s = self.load_recorded(lidar, timed=True)
             if times_s is not None and np.ptp(times_s) > _INSTANT_S:
                 return points, times_s
         return None
@@ -308,6 +346,8 @@ class Frame:
         }
         if self.lidar_paths:
             files["lidars"] = {name: str(path) for name, path in self.lidar_paths.items()}
+        if self.joined:
+            files["joined"] = {name: T.tolist() for name, T in self.joined.items()}
         if self.columns is not None:
             files[_COLUMNS] = list(self.columns)
         motion = self.motion
@@ -392,11 +432,12 @@ def frame_of_entry(entry: Mapping[str, Any]) -> Frame:
     images = {name: Path(path) for name, path in entry["images"].items()}
     lidars = {name: Path(path) for name, path in entry.get("lidars", {}).items()}
     files = entry["frame"], entry["name"], Path(entry["cloud"]), images
-    motion, columns = entry.get(_MOTION), entry.get(_COLUMNS)
-    if motion is None:
-        return Frame(*files, lidar_paths=lidars, columns=columns)
+    joined = {name: np.array(T) for name, T in entry.get("joined", {}).items()}
+    frame = Frame(*files, lidar_paths=lidars, columns=entry.get(_COLUMNS), joined=joined)
+    if (motion := entry.get(_MOTION)) is None:
+        return frame
     found = ScanMotion(tuple(motion["twist_per_s"]), motion["to_s"])
-    return Frame(*files, find_motion=lambda: found, lidar_paths=lidars, columns=columns)
+    return replace(frame, find_motion=lambda: found)
 
 
 def hash_source(path: Path) -> str:

@@ -124,6 +124,7 @@ class Calibration:
         frames: of ``calibrate``: per frame its ``frame`` number, ``name``, ``cloud`` file, and
             ``images``, a file per camera.
         moves: of ``track``: what moved, since when, how far, in words.
+        knows_motion: of ``track``: whether its frames have the motion of the LiDAR.
         places: frame numbers of each place; empty if nobody looked for places, and of ``track``.
         rounds: of ``calibrate``: per round and camera, the matches and how far it moved.
         warnings: of ``calibrate``: about the dataset, its guess, and a lens that did not settle.
@@ -154,6 +155,7 @@ class Calibration:
     lens_covariance: dict[str, Array] = field(default_factory=dict)
     frames: tuple[dict[str, Any], ...] = ()
     moves: tuple[str, ...] = ()
+    knows_motion: bool = False
     places: Groups = ()
     rounds: tuple[Mapping[str, Any], ...] = ()
     warnings: tuple[str, ...] = ()
@@ -269,11 +271,8 @@ class Calibration:
         By what was estimated, whether the LiDAR's motion is known, and when points were taken.
         Without either, clouds count as corrected for it.
         """
-        table, cameras, estimated = self.correspondences, self.rig.cameras, {*self.config.estimate}
-        if table is None:  # of a tracker, which corrects for the motion what the rig states
-            moves = any(camera.time_offset_s or camera.readout_s for camera in cameras.values())
-        else:
-            moves = table.twist_per_s is not None
+        table, estimated = self.correspondences, {*self.config.estimate}
+        moves = self.knows_motion if table is None else table.twist_per_s is not None
         timed = moves or (table is not None and table.late_s is not None)
         free = self.lens and estimated - {"offset", "readout"}
         lens = "other intrinsics" if free else "intrinsics"
@@ -358,8 +357,8 @@ _KEYS = (
     "covariance_of", "covariance", "joint_names", "joint_covariance", "pair_covariance_of",
     "pair_covariance",
     "lens", "lens_covariance", "residuals", "counts", "frames_used",
-    "moves", "places", "rounds", "warnings", "initial_rig", "stage1_T_camera_lidar", "terms",
-    "config", "timings_s", "inputs", "versions", "date",
+    "moves", "knows_motion", "places", "rounds", "warnings", "initial_rig",
+    "stage1_T_camera_lidar", "terms", "config", "timings_s", "inputs", "versions", "date",
 )  # fmt: skip
 """Of the file, in its order; those that are no attributes are made for it."""
 

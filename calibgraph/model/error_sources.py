@@ -17,6 +17,7 @@ PAIRS = "images of camera pairs"
 PRIORS = "priors and relative poses"
 LENSES = "uncertain lenses and clocks"
 ESTIMATED = "estimated lenses and clocks"
+OTHER_LIDARS = "poses of other LiDARs"
 FLAT = "flat evidence of the images"
 
 NEEDED = 0.3
@@ -50,6 +51,7 @@ SHRINKS_WITH = {
     PRIORS: "better measurements of priors and relative_poses",
     LENSES: "a calibration of the lens",
     ESTIMATED: "a calibration of the lens",
+    OTHER_LIDARS: "instants at more places, for the LiDARs",
     FLAT: "frames at more places, with walls, poles or vehicles",
 }
 """What would shrink an error bar that is mostly of this source."""

@@ -18,7 +18,8 @@ from calibgraph.files import describe
 
 _OF_ONE_SEARCH = ("found", "missed", "chance")
 _PER_CAMERA = (
-    "z_score", *_OF_ONE_SEARCH, "contradicted", "start_dependence", "memorization", "failed_share"
+    "z_score", *_OF_ONE_SEARCH, "contradicted", "start_dependence", "memorization", "failed_share",
+    "by_lidars",
 )  # fmt: skip
 IMAGES = "calibgraph_images"
 """Key of what the images said of a result; its content is of ``calibgraph.trust.image_record``."""
@@ -52,6 +53,8 @@ class MatcherFindings:
         chance: probability that a search with nothing to find ends at as high a z-score; of a
             search in one to three frames alone, which measures it (0 to 1).
         contradicted: by camera that the search found, the camera whose features place it elsewhere.
+        by_lidars: (6, k) by how much a camera, in the tangent of T_lidar_camera, errs by a standard
+            deviation of each error of the poses of other LiDARs, whose points it is matched with.
         stage1: ``rig`` if the matches of a single frame determine no pose, else ``pnp``.
         range_rotation_deg, range_translation_m: how far from the guess it searches, per axis; None
             if unknown.
@@ -76,6 +79,7 @@ class MatcherFindings:
     missed: Mapping[str, _Finite] = field(default_factory=dict)
     chance: Mapping[str, _Finite] = field(default_factory=dict)
     contradicted: Mapping[str, str] = field(default_factory=dict)
+    by_lidars: Mapping[str, list[list[_Finite]]] = field(default_factory=dict)
     stage1: Literal["pnp", "rig"] = "pnp"
     range_rotation_deg: Annotated[float | None, _up_to(180)] = None
     range_translation_m: Annotated[float | None, _up_to(100)] = None

@@ -128,7 +128,7 @@ class CameraBlock:
         medians = median_norm(self.information)
         if self.information is None:
             norms = self.block.run_norms(T_camera_lidar, runs) / medians
-            return norms[0], norms[-1]
+            return (sizes := norms[0]), sizes if len(norms) == 1 else norms[1]
         sizes_px = self._constrained.run_norms(T_camera_lidar, runs)[-1] / medians
         return sizes_px, self.block.run_norms(T_camera_lidar, runs)[-1] / medians
 
@@ -187,7 +187,10 @@ class CameraBlock:
 
     def scale(self, T_camera_lidar: Array, config: Config) -> ResidualScale:
         """The configured scales, or those of the residuals' own spread at a T_camera_lidar."""
-        sizes_px, sizes = self.all_sizes(T_camera_lidar[None])
+        return self.scale_of(*self.all_sizes(T_camera_lidar[None]), config)
+
+    def scale_of(self, sizes_px: Array, sizes: Array, config: Config) -> ResidualScale:
+        """The same of residuals by :meth:`all_sizes`."""
         if config.loss_scale_px is not None and config.gate_px is not None:
             unmeasured = math.nan if np.isfinite(sizes_px).any() else math.inf
             return ResidualScale(1.0, config.loss_scale_px, config.gate_px, unmeasured)

@@ -233,7 +233,7 @@ class Linearization:
             *by.shape[:2], 6, 6
         )
         by[..., :6, 6:12] = by_shared[1:]
-        softened, pulled, seen = _soften(
+        softened, pulled, seen = soften(
             self.data.hessian, self.data.gradient, covariance[1:], error[1:]
         )
         of_cameras, pulls = _turned(by) @ softened @ by, _times(_turned(by), pulled)
@@ -243,7 +243,7 @@ class Linearization:
         for pair, sums, at in zip(model.pairs, self.pairs, model.columns_of_pairs, strict=True):
             hessian[np.ix_(pair.places, at, at)] += sums.hessian
             gradient[np.ix_(pair.places, at)] += sums.gradient
-        softened, pulled, own = _soften(hessian, gradient, covariance[0], error[0])
+        softened, pulled, own = soften(hessian, gradient, covariance[0], error[0])
         by_cloud = np.tile(np.eye(6 + k, k, -6), (count, 1, 1))
         by_cloud[:, :6, :6] = by_shared[0]
         cloud = own._replace(rows=own.rows @ by_cloud)
@@ -347,7 +347,7 @@ class Linearization:
         return bool(((variances > 0) & (variances < _FREE**2)).all())
 
 
-def _soften(
+def soften(
     hessian: Array, gradient: Array, covariance: Array, error: Array
 ) -> tuple[Array, Array, Displacement]:
     """A quadratic whose pose has been set free about a tie, in the step of c + e.

@@ -152,6 +152,19 @@ class Solution:
         """
         return travel_errors(self.fitted)
 
+    @cached_property
+    def by_lidars(self) -> Array:
+        """(6 N, k) of poses, by a standard deviation of errors of the poses of other LiDARs."""
+        known = self.correspondences.findings.by_lidars
+        size = max((np.shape(of)[1] for of in known.values()), default=0)
+        each = [known.get(name, np.zeros((6, size))) for name in self.T_camera_lidar]
+        return np.array(each, np.float64).reshape(6 * len(each), size)
+
+    @cached_property
+    def outside(self) -> Array:
+        """(6 N, 6 N) what both add to ``covariance``."""
+        return self.travel @ self.travel.T + self.by_lidars @ self.by_lidars.T
+
     @property
     def mount(self) -> ErrorFit | None:
         """The fit of the mounts, between which images and measurements show relative poses."""
@@ -171,7 +184,8 @@ class Solution:
         """
         if self.error_fit is None:
             return {}
-        return error_sources(self.error_fit, joint, self.travel, self.held)
+        columns = self.travel, self.by_lidars
+        return error_sources(self.error_fit, joint, columns, self.held)
 
     @cached_property
     def pair_terms(self) -> tuple[PairTerm, ...]:

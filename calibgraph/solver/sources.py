@@ -21,6 +21,7 @@ from calibgraph.model.error_sources import (
     LENSES,
     MATCHES,
     MOTION,
+    OTHER_LIDARS,
     PAIRS,
     PLACES,
     PRIORS,
@@ -38,20 +39,22 @@ _NOTHING = 1e-8  # share of a variance: rounding of a difference
 
 
 def error_sources(
-    errors: ErrorFit, joint: Array, travel: Array, without: Container[str] = ()
+    errors: ErrorFit, joint: Array, outside: tuple[Array, Array], without: Container[str] = ()
 ) -> dict[str, ErrorSources]:
     """Per camera, the sources of its error bar, the matches as those of the rest.
 
     Args:
         errors: the error model at the estimate.
         joint: (6 N, 6 N) the reported covariance, which may be wider than that of the matches.
-        travel: (6 N, k) columns of it by the unknown motion of the vehicle.
+        outside: (6 N, k) columns of it by the unknown motion of the vehicle, and by the errors of
+            the poses of other LiDARs.
         without: cameras that have no error bar.
     """
     total, found = np.diag(joint), {}
-    swept = (travel**2).sum(axis=1)
-    flat = total - swept - np.diag(errors.covariance)
-    parts = {**variances_by_source(errors), FLAT: flat}
+    swept, of_lidars = ((columns**2).sum(axis=1) for columns in outside)
+    fixed = swept + of_lidars
+    flat = total - fixed - np.diag(errors.covariance)
+    parts = {**variances_by_source(errors), FLAT: flat, OTHER_LIDARS: of_lidars}
     parts[MOTION] = parts[MOTION] + swept
     rest = np.maximum(total - np.sum([*parts.values()], axis=0), 0.0)
     variances, forecast = {MATCHES: rest, **parts}, predict_variances(errors)
@@ -62,7 +65,7 @@ def error_sources(
                 _shares(variances, first + int(np.argmax(total[first : first + 3])))
                 for first in (rows.start, rows.start + 3)
             )
-            later = {k: _error_bar((own + swept + flat / k)[rows]) for k, own in forecast.items()}
+            later = {k: _error_bar((own + fixed + flat / k)[rows]) for k, own in forecast.items()}
             found[name] = ErrorSources(*_error_bar(total[rows]), rotation, translation, later)
     return found
 

@@ -2,30 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 
 import numpy as np
 
 from calibgraph.arrays import Array
 from calibgraph.errors import CorrespondenceError
 from calibgraph.model.correspondences import Correspondences, concatenate
+from calibgraph.model.geometry import invert
 from calibgraph.model.rig import Rig
 from calibgraph.pipeline import solve
 from calibgraph.solver.columns import distortion_evidence
 from calibgraph.solver.lens import considered_lens, error_by_lens, lens_columns
-from calibgraph.solver.matches import CameraBlock, camera_blocks, merge
+from calibgraph.solver.matches import CameraBlock, camera_blocks
+from calibgraph.solver.pnp import frame_pose
 from calibgraph.solver.preprocess import preprocess
 from calibgraph.solver.within_place import WEAK
 from calibgraph.tracking.cause import chance_limit
 from calibgraph.tracking.estimate import EpochGraph, states_places
 from calibgraph.tracking.events import Event
 from calibgraph.tracking.frames import StreamFrame, findings_of
-from calibgraph.tracking.gate import Gated, agrees, find_outlier_frame, sums_of
-from calibgraph.tracking.state import BEND, COUNTS, HISTORY, OutlierFrame, State
+from calibgraph.tracking.gate import Gated, refine
+from calibgraph.tracking.state import BEND, COUNTS, HISTORY, State
 from calibgraph.tracking.sums import Sums
+from factors import BlockSums, to_runs
+from factors.pose_kernel import logarithms
 
 _LAST_FRAMES = 20  # of which it is kept whether they agree with the estimate
-_ABSORBED = np.array([[name == one for one in ("given", "used", "absorbed")] for name in COUNTS])
 _UNUSUAL = 25.0  # squared sigmas of a six-vector
 _TOTAL_KEPT = 1 - 1 / 2000  # of the total scatter, from frame to frame
 _SEEN = 3000  # at most, of the matches whose directions and distances are those of scenes
@@ -36,7 +39,7 @@ def begin_frames(state: State, frames: Sequence[StreamFrame]) -> None:
     """Begin frames, none of whose matches is absorbed."""
     last, n = frames[-1], len(state.names)
     tables = [one.table for one in frames if len(one.table)][-1:]
-    state.frame, state.stamp_ns = last.frame, last.stamp_ns
+    state.stamp_ns = last.stamp_ns
     state.updates += len(frames)
     for table in tables:
         state.knows_motion = table.twist_per_s is not None
@@ -51,37 +54,59 @@ def begin_frames(state: State, frames: Sequence[StreamFrame]) -> None:
     state.sums = Sums(np.concatenate([state.sums.packed, none]))
 
 
-def absorb(state: State, gated: Mapping[int, Gated]) -> list[dict[int, int]]:
-    """Take in the inliers of frames that have begun; of each open one, how many by camera.
-
-    Frames of a camera with too few are left out.
-    """
-    used = [dict[int, int]() for _ in range(state.sizes[-1])]
-    kept = {camera: one.select(one.enough) for camera, one in gated.items()}
-    kept = {camera: one for camera, one in kept.items() if len(one.counts)}
+def absorb(state: State, gated: Mapping[int, Gated]) -> None:
+    """Take in the inliers of frames that have begun; frames with too few of them are left out."""
+    kept = {camera: one.select(one.enough) for camera, one in gated.items() if one.enough.any()}
     if not kept:
-        return used
-    cameras = np.repeat([*kept], [len(one.counts) for one in kept.values()])
+        return
+    cameras = np.repeat([*kept], [one.raw.frames for one in kept.values()])
     numbers = np.concatenate([one.raw.frame_numbers for one in kept.values()])
-    rows, closed = np.searchsorted(state.numbers, numbers), state.closed
-    sums, packed = sums_of(state, kept), state.sums.packed.copy()
-    packed[rows, cameras] = sums.packed
-    state.sums = Sums(packed)
-    counts = sums.matches.astype(np.int64)
-    for row, camera, count in zip(rows.tolist(), cameras.tolist(), counts.tolist(), strict=True):
-        if row >= closed:
-            used[row - closed][camera] = count
-    agreements, whole = [*state.agreements], state.counts.copy()
-    blocks, inliers = [*state.blocks], [*state.inliers]
+    rows = np.searchsorted(state.numbers, numbers)
+    state.sums = state.sums.replace_at((rows, cameras), sums_of(state, kept))
     for camera, one in kept.items():
-        agreed = (*agreements[camera], *((n, True) for n in one.raw.frame_numbers.tolist()))
-        agreements[camera] = agreed[-_LAST_FRAMES:]
-        blocks[camera] = (*blocks[camera], one.raw)
-        inliers[camera] = (*inliers[camera], one.inliers)
-        whole[camera] += _ABSORBED @ [len(one.inliers), int(one.counts.sum()), len(one.counts)]
-    state.agreements, state.counts = tuple(agreements), whole
-    state.blocks, state.inliers = tuple(blocks), tuple(inliers)
-    return used
+        agreed = ((number, True) for number in one.raw.frame_numbers.tolist())
+        state.put(
+            camera,
+            matches=(*state.matches[camera], one),
+            agreements=(*state.agreements[camera], *agreed)[-_LAST_FRAMES:],
+        )
+        used = int(one.counts.sum())
+        state.count(camera, given=len(one.inliers), used=used, absorbed=one.raw.frames)
+
+
+def sums_of(state: State, gated: Mapping[int, Gated]) -> Sums:
+    """(f,) sums of the inliers in the frames of each camera in turn, about its reference.
+
+    The true Hessian of few matches is noise, and may not be definite: its ratio to the one by
+    weights is that of all frames.
+
+    Args:
+        state: with the scales of the residuals, and how curved their cost is.
+        gated: by camera; linearized at its poses.
+    """
+    parts, cameras = [], list[int]()
+    for camera, one in gated.items():
+        edges = np.concatenate([[0], one.counts.cumsum().astype(np.int64)])
+        block = one.raw.with_scale(state.scales[camera]).select(one.inliers)
+        parts.append(block.summarize(one.poses, to_runs(edges)))
+        cameras += [camera] * one.raw.frames
+    here, to = BlockSums.join(parts), state.references[cameras]
+    poses = np.concatenate([one.poses for one in gated.values()])
+    root = np.linalg.cholesky(here.hessian + WEAK)
+    hessian = root @ state.curvature[cameras] @ root.swapaxes(1, 2)
+    gradient = here.gradient
+    if not np.array_equal(poses, to):
+        steps = logarithms(poses @ invert(to))
+        gradient = gradient + (hessian @ steps[..., None])[..., 0]
+    return Sums.zeros(len(cameras)).change(
+        hessian=hessian,
+        gradient=gradient,
+        reweighted=here.hessian,
+        score=gradient,
+        scatter=gradient[:, :, None] * gradient[:, None, :],
+        frames=np.ones(len(cameras)),
+        matches=np.concatenate([one.counts for one in gated.values()]),
+    )
 
 
 def add_to_totals(state: State, frames: Sums) -> None:
@@ -90,11 +115,10 @@ def add_to_totals(state: State, frames: Sums) -> None:
     An unusual frame is down-weighted: it may come after a move that has not been detected yet.
     """
     count, scores = len(frames.packed), frames.score.copy()
-    for camera in range(len(state.names)):
-        noise, own = state.frame_noise(camera), scores[:, camera]
-        if noise is not None:
-            unusual = (own * np.linalg.solve(noise, own.T).T).sum(axis=1)
-            own *= np.sqrt(_UNUSUAL / np.maximum(unusual, _UNUSUAL))[:, None]
+    known = state.is_known
+    own = scores[:, known]
+    unusual = (own * np.linalg.solve(state.frame_noise[known], own[..., None])[..., 0]).sum(axis=-1)
+    scores[:, known] = own * np.sqrt(_UNUSUAL / np.maximum(unusual, _UNUSUAL))[..., None]
     ages, kept = _TOTAL_KEPT ** np.arange(count - 1.0, -1.0, -1.0), _TOTAL_KEPT**count
     flat = scores.reshape(count, -1)
     state.total = kept * state.total + (ages * flat.T) @ flat
@@ -111,49 +135,68 @@ def select_agreeing(
     """
     agreeing = {}
     for camera, one in gated.items():
-        if one.agree(state, camera).all():
+        if one.agrees(state.share[camera]):
             agreeing[camera] = one
             continue
-        own = find_outlier_frame(state, camera, one.raw)
-        there = None if own is None else _at_its_place(state, graph, camera, own)
-        if there is None:
-            _set_aside(state, camera, own)
+        own = _gated_alone(state, camera, one.raw)
+        if own is not None and _is_at_its_place(state, graph, camera, own):
+            agreeing[camera] = own
         else:
-            agreeing[camera] = there
+            _set_aside(state, camera, own)
     return agreeing
 
 
-def _at_its_place(state: State, graph: EpochGraph, camera: int, own: OutlierFrame) -> Gated | None:
-    """A frame that disagrees with a camera's estimate, if it agrees with the pose of its place.
+def _gated_alone(state: State, camera: int, raw: CameraBlock) -> Gated | None:
+    """A frame at its own T_camera_lidar; None if none explains it, so the matching failed."""
+    for start in _starts(state, camera, raw):
+        T = refine(raw, start, state.scales[camera], state.config)
+        own = Gated.at(T, raw, state.scales[camera])
+        if own.agrees(state.share[camera]):
+            return own
+    return None
+
+
+def _starts(state: State, camera: int, raw: CameraBlock) -> Iterator[Array]:
+    """Start values for the frame's own T_camera_lidar: the estimate; then PnP, if possible.
+
+    PnP takes several times as long as a fit from the estimate, which is mostly near enough. Both
+    end at the same minimum where most of the usual share of matches agrees.
+    """
+    yield state.references[camera]
+    if raw.information is not None or state.config.stage1 == "rig":
+        return
+    by_pnp = frame_pose(state.rig.cameras[state.names[camera]], raw.block, state.config)
+    if by_pnp is not None:
+        yield by_pnp
+
+
+def _is_at_its_place(state: State, graph: EpochGraph, camera: int, own: Gated) -> bool:
+    """Whether a frame that disagrees with a camera's estimate agrees with the pose of its place.
 
     In the graph with this frame: if its place is displaced by no more than places are, and the
     pose there explains it.
     """
     if state.walk[camera] or not states_places(state):
-        return None
-    scale = state.scales[camera]
-    gated = Gated.at(own.T_camera_lidar, own.raw, scale)
-    if not gated.enough.all():
-        return None
+        return False
     tried = state.draft()
-    tried.sums = state.sums.replace_at((-1, camera), sums_of(state, {camera: gated})[0])
+    tried.sums = state.sums.replace_at((-1, camera), sums_of(state, {camera: own})[0])
     squared, T = graph.at_its_place(tried)
     if squared[0] + squared[1 + camera] > chance_limit():
-        return None
-    return gated if agrees(state, camera, own.raw, T[camera]) else None
+        return False
+    return Gated.at(T[camera], own.raw, state.scales[camera]).agrees(state.share[camera])
 
 
-def _set_aside(state: State, camera: int, own: OutlierFrame | None) -> None:
+def _set_aside(state: State, camera: int, own: Gated | None) -> None:
     """Count a camera's frame as left out.
 
     It is kept as an outlier frame if another T_camera_lidar explains it; otherwise the matching has
     failed.
     """
-    kept = state.outliers[camera]
+    kept, number = state.outliers[camera], int(state.numbers[-1])
     state.put(
         camera,
         outliers=kept if own is None else (*kept, own)[-_LAST_FRAMES:],
-        agreements=(*state.agreements[camera], (state.frame or 0, False))[-_LAST_FRAMES:],
+        agreements=(*state.agreements[camera], (number, False))[-_LAST_FRAMES:],
     )
     state.count(camera, left_out=1, failed=1 if own is None else 0)
 
@@ -166,12 +209,12 @@ def count_repeats(state: State, given: Correspondences, again: Collection[int]) 
         given: the correspondences of a frame.
         again: numbers of its cameras that repeat.
     """
-    if not again and not state.counts[:, COUNTS.index("repeated")].any():
+    before = state.counts[:, COUNTS.index("repeated")]
+    if not again and not before.any():
         return
     for number in np.unique(given.camera_index).tolist():
         camera = state.names.index(given.cameras[number])
-        before = state.counted(camera, "repeated")
-        state.count(camera, repeated=1 if number in again else -before)
+        state.count(camera, repeated=1 if number in again else -int(before[camera]))
 
 
 def count_absent(state: State, used: Collection[int], frame: StreamFrame) -> list[Event]:
@@ -208,40 +251,34 @@ def start_cameras(state: State, table: Correspondences, seen: Collection[int]) -
         table: the correspondences of the frame.
         seen: the cameras that have enough of them.
     """
-    events = []
-    for camera in seen:
-        if not state.started[camera]:
-            _try_to_start(state, camera, table)
-            if state.started[camera]:
-                name, number = state.names[camera], state.frame or 0
-                events.append(Event("started", name, number, number, state.stamp_ns))
+    events, every = [], min(state.config.tracking.start_frames, HISTORY)
+    for camera in (camera for camera in seen if not state.started[camera]):
+        name, number = state.names[camera], int(state.numbers[-1])
+        own = table.of_camera(name).with_metadata(findings_of(table.findings).to_metadata())
+        waiting = (*state.waiting[camera], own)
+        state.put(camera, waiting=waiting[-HISTORY:])
+        if len(waiting) % every:
+            continue
+        state.put(camera, refused=_try_to_start(state, camera))
+        if state.started[camera]:
+            events.append(Event("started", name, number, number, state.stamp_ns))
+        elif len(waiting) >= HISTORY:  # tried with a full window: the older half is dropped
+            state.put(camera, waiting=waiting[HISTORY // 2 - HISTORY :])
     return events
 
 
-def _try_to_start(state: State, camera: int, table: Correspondences) -> None:
+def _try_to_start(state: State, camera: int) -> tuple[str, ...]:
+    """Start a camera by the batch solve of its first frames, or tell why not."""
     name = state.names[camera]
-    own = table.of_camera(name).with_metadata(findings_of(table.findings).to_metadata())
-    waiting = (*state.waiting[camera], own)
-    count, waiting = len(waiting), waiting[-HISTORY:]
-    state.put(camera, waiting=waiting)
-    if count % min(state.config.tracking.start_frames, HISTORY):
-        return
     rig = Rig(lidar=state.rig.lidar, cameras={name: state.rig.cameras[name]})
     try:
-        result = solve(rig, concatenate(waiting), state.config)
+        result = solve(rig, concatenate(state.waiting[camera]), state.config)
     except CorrespondenceError as error:
-        _wait_longer(state, camera, (str(error),))
-        return
+        return (str(error),)
     if result.verdict.status == "FAIL":
-        _wait_longer(state, camera, result.camera_verdicts[name].reasons)
-        return
+        return result.camera_verdicts[name].reasons
     _start_camera(state, camera, result.T_camera_lidar[name])
-
-
-def _wait_longer(state: State, camera: int, reasons: tuple[str, ...]) -> None:
-    state.put(camera, refused=reasons)
-    if len(state.waiting[camera]) >= HISTORY:  # tried with a full window: the older half is dropped
-        state.put(camera, waiting=state.waiting[camera][HISTORY // 2 :])
+    return ()
 
 
 def _start_camera(state: State, camera: int, T_camera_lidar: Array) -> None:
@@ -250,13 +287,14 @@ def _start_camera(state: State, camera: int, T_camera_lidar: Array) -> None:
     raw = camera_blocks(state.rig, kept.table, state.config)[state.names[camera]]
     scale = raw.scale(T_camera_lidar, state.config)
     gated = Gated.at(T_camera_lidar, raw, scale)
+    curvature = gated.curvature(T_camera_lidar, scale)
     state.put(
         camera,
-        started=True, waiting=(), refused=(), references=T_camera_lidar,
-        scales=scale, share=gated.usual_share, curvature=gated.curvature(scale),
+        started=True, waiting=(), references=T_camera_lidar,
+        scales=scale, share=gated.usual_share, curvature=curvature,
     )  # fmt: skip
     _consider_lens(state, camera, raw.select(gated.inliers))
-    absorb_again(state, camera, [raw], T_camera_lidar)
+    absorb_again(state, camera, raw, T_camera_lidar)
 
 
 def count_epoch(state: State, camera: int, first: int) -> None:
@@ -264,7 +302,7 @@ def count_epoch(state: State, camera: int, first: int) -> None:
     own = state.matches_of(camera)
     if own is None:
         return
-    recent = own[0].select(own[1] & (own[0].frame >= first))
+    recent = own.raw.select(own.inliers & (own.raw.frame >= first))
     if len(recent):
         bends = state.bends[camera] + _bends_of(state, camera, recent)
         state.put(camera, lens=_consider_lens(state, camera, recent), bends=bends)
@@ -279,7 +317,7 @@ def _consider_lens(state: State, camera: int, matches: CameraBlock) -> Array:
     if before.shape == columns.shape:  # else motion became known, or none yet
         columns = columns + before
     kept = state.matches_of(camera)  # in more directions than those of one epoch
-    seen = matches if kept is None else kept[0].select_evenly(_SEEN)
+    seen = matches if kept is None else kept.raw.select_evenly(_SEEN)
     found = error_by_lens(lens, columns, seen.block, T, of=state.config.of)
     errors = np.zeros((6, 6)) if found is None else found
     if (known := state.lens_errors[camera]).any():
@@ -296,33 +334,26 @@ def _bends_of(state: State, camera: int, matches: CameraBlock) -> Array:
     """
     if not any(state.findings.bend_sigmas):
         return np.zeros(BEND)
-    numbers, at = matches.frame_numbers, dict[str, list[int]]()
-    for number, row in zip(numbers.tolist(), np.searchsorted(state.numbers, numbers), strict=True):
-        at.setdefault(state.at[row], []).append(number)
-    places = [np.array(of_place, dtype=np.int64) for of_place in at.values()]
+    numbers = matches.frame_numbers
+    at = np.array(state.at)[np.searchsorted(state.numbers, numbers)]
+    places = [numbers[at == name] for name in dict.fromkeys(at.tolist())]
     T = state.references[camera]
     one = distortion_evidence(matches, state.scales[camera], T, WEAK, places=places)
     parts = one.hessian, one.hessian @ one.jacobian, one.information, one.vector
     return np.concatenate([part.ravel() for part in parts])
 
 
-def absorb_again(
-    state: State, camera: int, blocks: Sequence[CameraBlock], T_camera_lidar: Array
-) -> None:
-    """Absorb frames that are kept, with the camera at a new estimate."""
-    poses = state.poses.copy()
-    poses[:, camera] = T_camera_lidar
-    state.poses = poses
+def absorb_again(state: State, camera: int, raw: CameraBlock | None, T_camera_lidar: Array) -> None:
+    """Absorb matches of frames that are kept, in their order, with the camera at a new estimate."""
     state.put(camera, references=T_camera_lidar)
     state.settled, state.steps = (), state.steps[:0]
     state.weights, state.shared = state.weights[:0], np.zeros_like(state.shared)
-    if blocks:
-        raw = merge(blocks)
-        raw = raw.select(np.argsort(raw.frame, kind="stable"))
+    if raw is not None:
         raw = raw.select(np.isin(raw.frame, state.numbers))
         if len(raw):
             absorb(state, {camera: Gated.at(T_camera_lidar, raw, state.scales[camera])})
     own, bends = state.matches_of(camera), state.bends[camera].copy()
-    kept = None if own is None else own[0].select(own[1])  # follow the distortion in another way
-    bends[:54] = _bends_of(state, camera, kept)[:54] if kept else 0.0
+    bends[:54] = 0.0  # the matches follow the distortion in another way
+    if own is not None:
+        bends[:54] = _bends_of(state, camera, own.raw.select(own.inliers))[:54]
     state.put(camera, bends=bends)

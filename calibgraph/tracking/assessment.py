@@ -105,34 +105,31 @@ def covariance_by_camera(estimate: Estimate, names: tuple[str, ...]) -> dict[str
 
 def _counts(state: State, camera: int) -> dict[str, int]:
     """Correspondences and frames, by what became of them."""
-    counts = {key: state.counted(camera, key) for key in ("given", "used", "left_out", "failed")}
-    used, waiting = state.counted(camera, "absorbed"), len(state.waiting[camera])
+    counts = dict(zip(COUNTS, state.counts[camera].tolist(), strict=True))
+    used, waiting = counts.pop("absorbed"), len(state.waiting[camera])
+    del counts["repeated"]
     frames = used + counts["left_out"] + waiting
     return {**counts, "frames": frames, "frames_used": used, "frames_waiting": waiting}
-
-
-def second_moments(estimate: Estimate) -> Array:
-    """(6 n, 6 n) of the mounts about the estimates."""
-    mounts, covariance = estimate.window.reported("mount")
-    away = logarithms(estimate.T_camera_lidar @ invert(mounts)).ravel()
-    return covariance + np.outer(away, away)
 
 
 def to_calibration(state: State, estimate: Estimate) -> Calibration:
     """The present estimate as a result of the same type as a batch's."""
     joint = estimate.covariance
-    known = None if np.isnan(joint).any() else joint
-    mounts = None if known is None else second_moments(estimate)
+    known, second_moments = None if np.isnan(joint).any() else joint, None
+    if known is not None:  # of the mounts about the estimates
+        mounts, covariance = estimate.window.reported("mount")
+        away = logarithms(estimate.T_camera_lidar @ invert(mounts)).ravel()
+        second_moments = covariance + np.outer(away, away)
     rig, cameras = state.rig_at(estimate.T_camera_lidar), [*enumerate(state.names)]
     return Calibration(
         rig=rig,
         initial_rig=state.rig,
         covariance=covariance_by_camera(estimate, state.names),
         joint_covariance=known,
-        pair_covariance=pair_covariances(mounts, rig.T_camera_lidar),
+        pair_covariance=pair_covariances(second_moments, rig.T_camera_lidar),
         camera_verdicts=dict(Verdicts(state, estimate)),
         residuals={
-            name: own[0].summary(state.references[camera], state.scales[camera])
+            name: own.raw.summary(state.references[camera], state.scales[camera])
             for camera, name in cameras
             if (own := state.matches_of(camera)) is not None
         },
@@ -141,6 +138,7 @@ def to_calibration(state: State, estimate: Estimate) -> Calibration:
         terms="full",
         config=state.config,
         moves=tuple(map(str, state.moves)),
+        knows_motion=bool(state.knows_motion),
     )
 
 

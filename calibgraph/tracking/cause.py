@@ -11,7 +11,6 @@ up to. Each is compared with the one before: what lasts longer is a move or a dr
 
 from __future__ import annotations
 
-import math
 from collections.abc import Collection
 from dataclasses import dataclass
 
@@ -68,9 +67,9 @@ class Steps:
         """(6 n, 6) derivative of all cameras' steps by a step of the LiDAR."""
         return adjoints(self.T_camera_lidar).reshape(-1, _POSE)
 
-    def of(self, place: int) -> tuple[Array, Array]:
-        """(6,) step and (6, 6) covariance of the camera at that place of ``cameras``."""
-        rows = pose_rows(place)
+    def of(self, camera: int) -> tuple[Array, Array]:
+        """(6,) step and (6, 6) covariance of a camera."""
+        rows = pose_rows(self.cameras.index(camera))
         return self.step[rows], self.covariance[rows, rows]
 
 
@@ -97,13 +96,13 @@ def find_cause(steps: Steps, found_by: Collection[int] = ()) -> Cause:
         steps: of all cameras.
         found_by: cameras that have moved, whatever the size of their step.
     """
-    moved = [
-        place
-        for place, camera in enumerate(steps.cameras)
-        if camera in found_by or squared_sigmas(*steps.of(place)) > steps.limits[place]
-    ]
-    alone = Cause(tuple(steps.cameras[place] for place in moved))
-    if not moved or len(steps.cameras) == 1:
+    moved = (
+        camera
+        for camera, limit in zip(steps.cameras, steps.limits, strict=True)
+        if camera in found_by or squared_sigmas(*steps.of(camera)) > limit
+    )
+    alone = Cause(tuple(moved))
+    if not alone.cameras or len(steps.cameras) == 1:
         return alone
     left, left_by_camera = unexplained(steps)
     of_others = float(np.sort(steps.limits)[1:].sum())
@@ -116,8 +115,11 @@ def unexplained(steps: Steps) -> tuple[float, float]:
     """Squared sigmas that are left by a move of the LiDAR, and by one of the best camera."""
     step, _ = _lidar_step(steps)
     by_lidar = squared_sigmas(steps.step - steps.by_lidar @ step, steps.covariance)
-    places = range(len(steps.cameras))
-    return by_lidar, min(_left_by_camera(steps, place) for place in places)
+    all_rows, by_camera = np.arange(len(steps.step)), []
+    for place in range(len(steps.cameras)):  # the steps of all others: zero if it moved alone
+        rows = np.delete(all_rows, pose_rows(place))
+        by_camera.append(squared_sigmas(steps.step[rows], steps.covariance[np.ix_(rows, rows)]))
+    return by_lidar, min(by_camera)
 
 
 def _lidar_step(steps: Steps) -> tuple[Array, Array]:
@@ -126,13 +128,6 @@ def _lidar_step(steps: Steps) -> tuple[Array, Array]:
     whitened = np.linalg.solve(steps.covariance, design)
     covariance: Array = np.asarray(np.linalg.inv(design.T @ whitened), dtype=np.float64)
     return covariance @ (whitened.T @ steps.step), covariance
-
-
-def _left_by_camera(steps: Steps, place: int) -> float:
-    """Squared sigmas of all other cameras' steps: zero if only this one moved."""
-    rows = np.ones(len(steps.step), dtype=np.bool_)
-    rows[pose_rows(place)] = False
-    return squared_sigmas(steps.step[rows], steps.covariance[np.ix_(rows, rows)])
 
 
 def squared_sigmas(step: Array, covariance: Array) -> float:
@@ -146,32 +141,35 @@ _KEPT = 0.995  # from epoch to epoch
 _UNUSUAL = 30.0  # squared sigmas of a six-vector: an epoch across a move counts for no more
 
 
-def add_epoch(group: Array, score: Array, frames: float, noise: Array) -> Array:
-    """(2,) number of a camera's epochs, and their squares over their frames' scatter, forgotten.
+def add_epoch(groups: Array, score: Array, frames: Array, noise: Array) -> Array:
+    """(k, 2) number of each camera's epochs, and their squares over their frames' scatter.
+
+    Both are forgotten slowly.
 
     Args:
-        group: before.
-        score: (6,) sum of the gradients of an epoch's frames.
-        frames: how many.
-        noise: (6, 6) covariance of one frame's.
+        groups: before.
+        score: (k, 6) sum of the gradients of an epoch's frames.
+        frames: (k,) how many.
+        noise: (k, 6, 6) covariance of one frame's.
     """
-    squared = float(score @ np.linalg.solve(noise, score)) / max(frames, 1.0)
-    return np.asarray(_KEPT * group + [1.0, min(squared, _UNUSUAL) / _POSE])
+    whitened = np.linalg.solve(noise, score[..., None])[..., 0]
+    squared = (score * whitened).sum(axis=1) / np.maximum(frames, 1.0)
+    own = np.minimum(squared, _UNUSUAL) / _POSE
+    return np.asarray(_KEPT * groups + np.stack([np.ones(len(own)), own], axis=1))
 
 
-def inflation(group: Array) -> float:
-    """Ratio of the epochs' scatter to that of their frames, on average; at least 1.
+def inflation(groups: Array) -> Array:
+    """(n,) ratio of the epochs' scatter to that of their frames, on average; at least 1.
 
     For alarms: after few epochs it has little bias.
     """
-    epochs, squared = group.tolist()
-    return max(1.0, squared / epochs) if epochs else 1.0
+    return np.asarray(np.maximum(groups[:, 1] / np.maximum(groups[:, 0], 1.0), 1.0))
 
 
-def sure_inflation(group: Array) -> float:
-    """The lower end of the 2-sigma interval of the inflation, for the error bar.
+def sure_inflation(groups: Array) -> Array:
+    """(n,) the lower end of the 2-sigma interval of the inflation, for the error bar.
 
     In place of the inflation itself, a static rig has bars a tenth wider than a batch's.
     """
-    epochs = max(float(group[0]), 1.0)
-    return max(1.0, inflation(group) * (1 - 2 * math.sqrt(2 / (_POSE * epochs))))
+    sigma = np.sqrt(2 / (_POSE * np.maximum(groups[:, 0], 1.0)))
+    return np.asarray(np.maximum(inflation(groups) * (1 - 2 * sigma), 1.0))

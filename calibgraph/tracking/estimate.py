@@ -9,10 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import NamedTuple
 
-import gtsam
 import numpy as np
 
 from calibgraph.arrays import Array, Mask
@@ -30,6 +29,7 @@ from calibgraph.solver.components import (
 )
 from calibgraph.solver.covariance import ENOUGH_FRAMES, pose_equations
 from calibgraph.solver.error_model import Conflict, relative_pose_conflict
+from calibgraph.solver.places import Displacement, soften
 from calibgraph.solver.within_place import (
     WEAK,
     allow_for_few_frames,
@@ -37,13 +37,11 @@ from calibgraph.solver.within_place import (
     split_excess,
 )
 from calibgraph.tracking.cause import sure_inflation
-from calibgraph.tracking.eliminate import Eliminated, block_diagonal, eliminate
 from calibgraph.tracking.state import State, rows_of
-from calibgraph.tracking.sums import Numbers, PlaceSums, Sums
+from calibgraph.tracking.sums import Numbers, PlaceSums, Sums, block_diagonal
 from calibgraph.tracking.window import Window
 
 _EXACT = 1e-4  # rad and m: what is stated of places to be smaller counts as nothing
-_ROUNDING = 1e-7  # rad and m: a pose that is shared more exactly makes the graph lose digits
 _SETTLED = 50.0  # frames of a camera: an epoch more hardly changes their scatter
 _ROUNDS = 2  # of estimates of the variance ratios, a fit after each
 _OPEN_WEIGHINGS, _MOST_WEIGHINGS, _SAME_WEIGHT = 2, 20, 1e-2
@@ -56,11 +54,13 @@ class Spread(NamedTuple):
         least: (n,) k, variance of matches of what they do not share, over that of independent ones.
         excess: (n, 6, 6) K - k.
         efficiency: (n,) of independent matches: their true variance over that of H, in the mean.
+        cloud: (6, 6) covariance of the cloud at a place, as the matcher states it.
     """
 
     least: Array
     excess: Array
     efficiency: Array
+    cloud: Array
 
 
 def spread_of(state: State, sums: PlaceSums) -> Spread:
@@ -73,18 +73,19 @@ def spread_of(state: State, sums: PlaceSums) -> Spread:
     hessian, reweighted, frames = every.hessian, every.reweighted, every.frames
     n = len(frames)  # of those without any, as of independent matches
     least, excess, efficiency = np.ones(n), np.tile(1e-3 * np.eye(6), (n, 1, 1)), np.ones(n)
+    if not states_places(state):
+        wider = np.where(state.is_known, sure_inflation(state.groups), 1.0)
+        scatter = scatter * wider[:, None, None]
     for camera in map(int, np.flatnonzero(frames)):
-        own = scatter[camera]
-        if not states_places(state) and state.scatter_of_frames(camera) is not None:
-            own = own * sure_inflation(state.groups[camera])
-        true = hessian[camera] + WEAK
+        true, matches = hessian[camera] + WEAK, every.matches[camera]
         own = allow_for_few_frames(
-            own, true, left[camera], frames=frames[camera], matches=every.matches[camera]
+            scatter[camera], true, left[camera], frames=frames[camera], matches=matches
         )
         root = np.linalg.cholesky(reweighted[camera] + WEAK)
         covariance, efficiency[camera] = relative_covariance(own, root, true)
         least[camera], excess[camera] = split_excess(covariance)
-    return Spread(least, excess, efficiency)
+    sizes = state.findings.place_rotation_rad, state.findings.place_translation_m
+    return Spread(least, excess, efficiency, pose_covariance(*np.square(sizes)))
 
 
 def states_places(state: State) -> bool:
@@ -102,21 +103,19 @@ class Terms:
         names: of the places.
         known: (P,) their rows among the places whose optimum is known, -1 of new ones.
         seen: (P, n) which cameras have matches there.
-        root: (P, n, 6, 6) Cholesky roots of the Hessians by weights.
-        least: (n,) k of ``calibgraph.solver.within_place``.
-        excess: (P, n, 6, 6) K - k, with what the matcher states of places.
+        information: (P, n, 6, 6) of the matches, zero where there are none.
         minimum: (P, n, 6) of the matches, from the references.
-        cloud: (P, 6, 6) information of the cloud's displacement.
+        at_place: (P, n, 6, 6) covariance of a camera's matches about its mean.
+        cloud: (P, 6, 6) covariance of the cloud's displacement.
         robust_scale: tuning constant of the loss; infinite: none.
     """
 
     names: tuple[str, ...]
     known: Numbers
     seen: Mask
-    root: Array
-    least: Array
-    excess: Array
+    information: Array
     minimum: Array
+    at_place: Array
     cloud: Array
     robust_scale: float
 
@@ -124,49 +123,42 @@ class Terms:
     def of(state: State, sums: PlaceSums, rows: Sequence[int], spread: Spread) -> Terms:
         """Of some rows of the sums over all frames."""
         own, findings, prior = sums.rows[rows], state.findings, error_components()
-        frames, places, settled = own.frames, sums.places[rows], state.settled
+        frames, places = own.frames, sums.places[rows]
         names, weighted = tuple(sums.names[row] for row in rows), own.reweighted + WEAK
-        row_of = dict(zip(settled, range(len(settled)), strict=True))
-        known = np.array([row_of.get(name, -1) for name in names], dtype=np.int64)
+        known = state.settled_rows(names)
         stated = findings.place_variance * spread.efficiency
         excess = spread.excess + (stated * frames / places)[..., None, None] * np.eye(6)
-        seen = frames > 0
+        seen, inverse = frames > 0, np.linalg.inv(np.linalg.cholesky(weighted))
         alike = np.where(seen, places, np.inf).min(axis=1)
-        sizes = findings.place_rotation_rad, findings.place_translation_m
         return Terms(
             names,
             known,
             seen,
-            np.asarray(np.linalg.cholesky(weighted)),
-            spread.least,
-            state.ratios.cameras * excess,
+            weighted * (seen / spread.least)[..., None, None],
             _minimum(state, own, known, weighted),
-            alike[:, None, None] * _cloud_information(*sizes, state.ratios.cloud),
+            state.ratios.cameras * (inverse.swapaxes(2, 3) @ excess @ inverse),
+            state.ratios.cloud * spread.cloud / alike[:, None, None],
             prior.robust_sigmas if sums.count >= prior.robust_places else np.inf,
         )
 
-    def eliminate(self, weights: Array, adjoint: Array) -> Eliminated:
+    def eliminate(self, weights: Array, chain: Array) -> Eliminated:
         """The places without their poses, for (P, 1 + n) weights in the loss."""
-        noise = self.excess / weights[:, 1:, None, None]
-        noise = noise + self.least[:, None, None] * np.eye(6)
-        weight = self.root @ np.linalg.inv(noise) @ self.root.swapaxes(2, 3)
-        weight = (weight + weight.swapaxes(2, 3)) * (0.5 * self.seen[..., None, None])
-        return eliminate(weight, self.minimum, self.cloud * weights[:, :1, None], adjoint)
+        at_place, pull = self.at_place / weights[:, 1:, None, None], self._pull
+        hessian, gradient, cameras = soften(self.information, pull, at_place, np.zeros(6))
+        by = chain.reshape(-1, 6, chain.shape[1])
+        hessian = (by.swapaxes(1, 2) @ hessian @ by).sum(axis=1)
+        gradient = gradient.reshape(-1, len(chain)) @ chain
+        cloud = self.cloud / weights[:, :1, None]
+        hessian, gradient, of_cloud = soften(hessian, gradient, cloud, np.zeros(6))
+        return Eliminated(hessian.sum(axis=0), gradient.sum(axis=0), of_cloud, cameras, by)
 
     @cached_property
-    def at_place(self) -> Array:
-        """(P, n, 6, 6) covariance of a camera's matches about its mean."""
-        inverse = np.linalg.inv(self.root)
-        exact = _ROUNDING**2 * np.eye(6)
-        return np.asarray(inverse.swapaxes(2, 3) @ self.excess @ inverse + exact)
-
-    def apart(self, found: Eliminated, shown: Array, weights: Array) -> tuple[Array, Array]:
-        """Displacements of the clouds, (P, 6), and of the cameras, (P, n, 6)."""
-        return found.displacements(shown, self.at_place / weights[:, 1:, None, None])
+    def _pull(self) -> Array:
+        return np.asarray(-(self.information @ self.minimum[..., None])[..., 0])
 
     def squared(self, u: Array, v: Array) -> Array:
         """(P, 1 + n) squared sigmas of such displacements, in a loss that is not robust."""
-        of_u = (u * (self.cloud @ u[..., None])[..., 0]).sum(axis=-1)
+        of_u = (u * np.linalg.solve(self.cloud, u[..., None])[..., 0]).sum(axis=-1)
         of_v = (v * np.linalg.solve(self.at_place, v[..., None])[..., 0]).sum(axis=-1)
         return np.column_stack([of_u, np.where(self.seen, of_v, 0.0)])
 
@@ -181,19 +173,59 @@ class Terms:
             weights[known] = state.weights[self.known[known]]
         return weights
 
-    def open_weights(self, state: State, adjoint: Array) -> Array:
+    def open_weights(self, state: State, chain: Array) -> Array:
         """The same while an epoch is open: of new places, from a non-robust start."""
         weights, new = self.known_weights(state), self.known < 0
         for _ in range(_OPEN_WEIGHINGS if np.isfinite(self.robust_scale) and new.any() else 0):
-            found = self.eliminate(weights, adjoint)
-            weights[new] = self.weigh(*self.apart(found, state.shared, weights))[new]
+            found = self.eliminate(weights, chain)
+            weights[new] = self.weigh(*found.displacements(state.shared))[new]
         return weights
 
 
-@lru_cache
-def _cloud_information(rotation_rad: float, translation_m: float, ratio: float) -> Array:
-    """(6, 6) of the displacement of the cloud at a place."""
-    return np.asarray(np.linalg.inv(ratio * pose_covariance(rotation_rad**2, translation_m**2)))
+class Eliminated(NamedTuple):
+    """Some places without their poses (``calibgraph.solver.places``).
+
+    What is left is a quadratic on the cloud's and the cameras' shared steps. It knows them by
+    where matches show the cameras, r: the rows of ``by``.
+
+    Attributes:
+        hessian: (6 + 6 n, 6 + 6 n) sum over the places.
+        gradient: (6 + 6 n,).
+        cloud: (P, ...) displacements u of the clouds.
+        cameras: (P, n, ...) displacements v of the cameras' matches, by their poses r - Ad u.
+        by: (n, 6, 6 + 6 n) derivative of r.
+    """
+
+    hessian: Array
+    gradient: Array
+    cloud: Displacement
+    cameras: Displacement
+    by: Array
+
+    def displacements(self, shown: Array) -> tuple[Array, Array]:
+        """(P, 6) u and (P, n, 6) v where matches show the cameras at (n, 6) r."""
+        u = self.cloud.step(np.concatenate([np.zeros(6), shown.ravel()]))
+        there, of = self.at_places(shown, u, np.zeros(6)), self.cameras
+        pull = (of.rows @ there[..., None])[..., 0] + of.pull
+        return u, -(of.free @ pull[..., None])[..., 0]
+
+    def at_places(self, shown: Array, u: Array, v: Array) -> Array:
+        """(P, n, 6) where matches show the cameras at each place, so displaced."""
+        return shown + v + np.asarray(self.by[:, :, :6] @ u[:, None, :, None])[..., 0]
+
+    def open_freedom(self, shown: Array) -> tuple[Array, Array]:
+        """(P,) and (P, n) degrees of freedom of u and v that the data leave open.
+
+        With the (6 n, 6 n) covariance of r.
+        """
+        known = np.zeros_like(self.hessian)
+        known[6:, 6:] = shown
+        by_cloud = self.cameras.rows @ self.by[:, :, :6]
+        moved = -self.cloud.free @ self.cloud.rows  # u by r
+        rows = self.cameras.rows @ self.by + by_cloud @ moved[:, None]
+        spread = by_cloud @ self.cloud.free[:, None] @ by_cloud.swapaxes(2, 3)
+        cameras = self.cameras._replace(rows=rows, spread=spread)
+        return self.cloud.open_freedom(known), cameras.open_freedom(known)
 
 
 def _minimum(state: State, own: Sums, known: Numbers, weighted: Array) -> Array:
@@ -202,9 +234,7 @@ def _minimum(state: State, own: Sums, known: Numbers, weighted: Array) -> Array:
     The gradient is that of the robust cost, by its true Hessian, where matches of the place show
     the cameras at the optimum of the last epoch; of a new place, at its own minimum.
     """
-    if (known < 0).all():
-        return np.asarray(-np.linalg.solve(own.hessian + WEAK, own.gradient[..., None])[..., 0])
-    at = np.where((known >= 0)[:, None, None], state.steps[known], 0.0)
+    at = np.concatenate([state.steps, np.zeros_like(own.gradient[:1])])[known]
     pull = own.gradient + (own.hessian @ at[..., None])[..., 0]
     by = np.where((known >= 0)[:, None, None, None], weighted, own.hessian + WEAK)
     return np.asarray(at - np.linalg.solve(by, pull[..., None])[..., 0])
@@ -228,6 +258,12 @@ class Estimate:
     conflicts: Mapping[int, Conflict]
     window: Window
 
+    @property
+    def contradicting(self) -> tuple[int, ...]:
+        """Relative poses that contradict the correspondences, by their places in the rig."""
+        limit = error_components().contradiction_sigmas
+        return tuple(place for place, one in self.conflicts.items() if one.largest > limit)
+
 
 class EpochGraph:
     """What stays the same until the end of an epoch.
@@ -241,26 +277,25 @@ class EpochGraph:
         self.settled, self.contradicting = state.settled, state.contradicting
         self.rig = state.rig_at(state.references)
         self.sums = state.sums_before_epochs()[-2]
-        self.places = closed_places(state)
+        self.places = state.places.add(state.at[: state.closed], state.sums[: state.closed])
+        for camera in state.drifting:
+            self.places = self.places.without(camera)
         frames = self.places.frames.sum(axis=0)
         self._is_settled = bool((frames[state.started] >= _SETTLED).all())
         self.spread = spread_of(state, self.places)
-        self.pose_graph = pose_priors(state)
-        T = dict(zip(state.names, state.references, strict=True))
+        out = {*state.dropped_pairs, *state.contradicting}  # by a move, or by the data
+        pairs = tuple(p for place, p in enumerate(state.rig.relative_poses) if place not in out)
+        rig, T = state.rig.model_copy(update={"relative_poses": pairs}), self.rig.T_camera_lidar
+        self.pose_graph = objective_graph(rig, {}, T, state.config, terms="full")
         self.prior = pose_equations(self.pose_graph, state.names, T)
         self.window = self.new_window(state)
         self._held: dict[frozenset[str], tuple[Array, Array]] = {}
 
-    def new_window(self, state: State) -> Window:
-        """What all places share, by the present ratios."""
-        return Window(self.shared_model(state, self.places, self.spread), state.references)
-
     def is_of(self, state: State) -> bool:
         """Whether the state is of the same epoch, with no change but more frames."""
         same = state.references is self.references and state.settled is self.settled
-        return (
-            same and state.findings == self.findings and state.contradicting == self.contradicting
-        )
+        same = same and state.findings is self.findings
+        return same and state.contradicting == self.contradicting
 
     def equation_5(self, sums: Sums) -> Array:
         """(n, 6) from the references to the minimum of Eq. 5 of the paper."""
@@ -277,17 +312,21 @@ class EpochGraph:
         open_sums = state.sums[state.closed :]
         sums = self.sums + open_sums.total()
         every = every_place(state, self.places, sums)
-        own = self.open_places(state, every)
+        names = {*state.at[state.closed :], *state.at[-1:]}
+        if not self._is_settled:  # that of all places changes with each frame
+            self._held.clear()
+            names |= {*every.names}
+        rows = [row for row in every.visited if every.names[row] in names]
+        own = Terms.of(state, every, rows, self.open_spread(state, every))
         touched = frozenset(own.names)
         if touched not in self._held:
             self._held[touched] = self._others(state, touched)
-        information, vector = self._held[touched]
+        hessian, gradient = self._held[touched]
         if own.names:
-            weights = own.open_weights(state, self.window.adjoint)
-            found = own.eliminate(weights, self.window.adjoint)
-            information, vector = information + found.information, vector + found.vector
-            self._open = own, weights, found
-        self.window.exchange(information, vector)
+            found = own.eliminate(own.open_weights(state, self.window.chain), self.window.chain)
+            hessian, gradient = hessian + found.hessian, gradient + found.gradient
+            self._open = own, found
+        self.window.exchange(hessian, gradient)
         T, covariance = self.window.reported(state.config.of)
         if state.config.preset != "auto":
             T = retract_all(state.references, self.equation_5(sums))
@@ -296,32 +335,18 @@ class EpochGraph:
         covariance[few], covariance[:, few] = np.nan, np.nan
         return Estimate(T, covariance, sums, self._conflicts(state, sums), self.window)
 
-    def open_places(self, state: State, every: PlaceSums) -> Terms:
-        """Those of the frames of the open epoch, and the last one; of a drift, all that it has."""
-        names = {*state.at[state.closed :], *state.at[-1:]}
-        if not self._is_settled:  # that of all places changes with each frame
-            self._held.clear()
-            names |= {*every.names}
-        found = np.flatnonzero(every.frames.any(axis=1)).tolist()
-        rows = [row for row in found if every.names[row] in names]
-        spread = self.open_spread(state, every)
-        return Terms.of(state, every, rows, spread)
-
     def open_spread(self, state: State, every: PlaceSums) -> Spread:
         """That of all frames; of many, the open epoch hardly changes it."""
         return self.spread if self._is_settled else spread_of(state, every)
 
     def _others(self, state: State, touched: frozenset[str]) -> tuple[Array, Array]:
-        """Information and vector of the closed places but some."""
-        frames = self.places.frames.any(axis=1)
-        names = self.places.names
-        rows = [row for row in np.flatnonzero(frames).tolist() if names[row] not in touched]
-        size = 6 * len(state.names)
+        """Hessian and gradient of the closed places but some."""
+        names, size = self.places.names, self.window.chain.shape[1]
+        rows = [row for row in self.places.visited if names[row] not in touched]
         if not rows:
             return np.zeros((size, size)), np.zeros(size)
         terms = Terms.of(state, self.places, rows, self.spread)
-        found = terms.eliminate(terms.known_weights(state), self.window.adjoint)
-        return found.information, found.vector
+        return terms.eliminate(terms.known_weights(state), self.window.chain)[:2]
 
     def at_its_place(self, state: State) -> tuple[Array, Array]:
         """(1 + n,) squared sigmas of the displacements at the last frame's place.
@@ -329,10 +354,10 @@ class EpochGraph:
         And (n, 4, 4) T_camera_lidar there.
         """
         self.solve(state)
-        own, weights, found = self._open
+        own, found = self._open
         row, shown = own.names.index(state.at[-1]), self.window.shown
-        u, v = own.apart(found, shown, weights)
-        steps = shown + v[row] - (self.window.adjoint @ u[row])
+        u, v = found.displacements(shown)
+        steps = found.at_places(shown, u, v)[row]
         return own.squared(u, v)[row], retract_all(state.references, steps)
 
     def _conflicts(self, state: State, sums: Sums) -> dict[int, Conflict]:
@@ -365,9 +390,9 @@ class EpochGraph:
             for place, pair in measured.items()
         }
 
-    def shared_model(self, state: State, sums: PlaceSums, spread: Spread) -> LatentPoseModel:
-        """What all places share."""
-        findings, bends, n = state.findings, state.bends, len(state.names)
+    def new_window(self, state: State) -> Window:
+        """What all places share, by the present ratios."""
+        findings, bends, n, spread = state.findings, state.bends, len(state.names), self.spread
         sigmas, shared = np.asarray(findings.bend_sigmas), state.ratios.shared
         size = len(sigmas)
         jacobian, shown, vector = np.zeros((n, 6, size)), np.zeros((size, size)), np.zeros(size)
@@ -375,7 +400,8 @@ class EpochGraph:
             hessian, pulled = bends[:, :36].reshape(-1, 6, 6), bends[:, 36:54].reshape(-1, 6, size)
             jacobian = np.linalg.solve(hessian + WEAK, pulled) * sigmas
             within = spread.least + np.trace(spread.excess, axis1=1, axis2=2) / 6
-            weight = 1.0 / (within + findings.place_variance * spread.efficiency * sums.alike)
+            alike = findings.place_variance * spread.efficiency * self.places.alike
+            weight = 1.0 / (within + alike)
             shown = np.outer(sigmas, sigmas) * (weight @ bends[:, 54:63]).reshape(size, size)
             vector = sigmas * (weight @ bends[:, 63:])
         each = np.tile(np.eye(6), (1, n, 1, 1))
@@ -393,7 +419,8 @@ class EpochGraph:
             distortion_vector=vector,
             distortion_size=shared,
         )
-        return SharedModel(state.names, {}, (), self.pose_graph, components, state.config.of)
+        model = SharedModel(state.names, {}, (), self.pose_graph, components, state.config.of)
+        return Window(model, state.references)
 
 
 @dataclass(frozen=True, eq=False)
@@ -404,30 +431,6 @@ class SharedModel(LatentPoseModel):
     def matched(self) -> list[int]:
         """All cameras, by number."""
         return [*range(len(self.cameras))]
-
-
-def pose_priors(state: State) -> gtsam.NonlinearFactorGraph:
-    """Priors about the references, and the relative poses that take part."""
-    rig, T = state.rig, dict(zip(state.names, state.references, strict=True))
-    out = {*state.dropped_pairs, *state.contradicting}  # by a move, or by the data
-    pairs = tuple(pair for place, pair in enumerate(rig.relative_poses) if place not in out)
-    rig = rig.model_copy(update={"relative_poses": pairs})
-    return objective_graph(rig, {}, T, state.config, terms="full")
-
-
-def contradicting(conflicts: Mapping[int, Conflict]) -> tuple[int, ...]:
-    """Those that take no part, by their places in the rig."""
-    limit = error_components().contradiction_sigmas
-    return tuple(place for place, one in conflicts.items() if one.largest > limit)
-
-
-def closed_places(state: State) -> PlaceSums:
-    """The sums of closed epochs at all places; of a drifting camera, none."""
-    closed = state.closed
-    places = state.places.add(state.at[:closed], state.sums[:closed])
-    for camera in state.drifting:
-        places = places.without(camera)
-    return places
 
 
 def every_place(state: State, closed: PlaceSums, sums: Sums) -> PlaceSums:
@@ -447,7 +450,7 @@ def every_place(state: State, closed: PlaceSums, sums: Sums) -> PlaceSums:
 def settle(state: State) -> EpochGraph:
     """Find optimum, weights and variance ratios of the closed epochs; the graph with these."""
     graph = EpochGraph(state)
-    rows = np.flatnonzero(graph.places.frames.any(axis=1)).tolist()
+    rows = graph.places.visited
     shows_ratios = len(rows) > 1 or bool(len(rows) and state.rig.relative_poses)
     for left in range(_ROUNDS if shows_ratios else 0, -1, -1):
         terms = Terms.of(state, graph.places, rows, graph.spread)
@@ -467,7 +470,7 @@ def settle(state: State) -> EpochGraph:
 def locate_places(state: State, graph: EpochGraph) -> None:
     """Find the optimum of all places, those of the open epoch too, for the present ratios."""
     every = every_place(state, graph.places, state.all_sums())
-    rows = np.flatnonzero(every.frames.any(axis=1)).tolist()
+    rows = every.visited
     if len(rows) > 1:
         _fit(state, Terms.of(state, every, rows, graph.spread), graph.window)
 
@@ -479,16 +482,16 @@ def _fit(state: State, terms: Terms, window: Window) -> Eliminated:
     """
     weights = terms.known_weights(state)
     for _ in range(_MOST_WEIGHINGS):
-        found = terms.eliminate(weights, window.adjoint)
-        window.exchange(found.information, found.vector)
+        found = terms.eliminate(weights, window.chain)
+        window.exchange(found.hessian, found.gradient)
         shown = window.shown
-        u, v = terms.apart(found, shown, weights)
+        u, v = found.displacements(shown)
         new = terms.weigh(u, v)  # 1 in a loss that is not robust
         if not new.size or np.abs(new - weights).max() < _SAME_WEIGHT:
             break
         weights = new
     state.settled, state.weights, state.shared = terms.names, weights, shown
-    state.steps = shown + v - (found.adjoint @ u[:, None, :, None])[..., 0]
+    state.steps = found.at_places(shown, u, v)
     return found
 
 
@@ -496,11 +499,9 @@ def _evidence(
     state: State, terms: Terms, found: Eliminated, window: Window
 ) -> dict[Component, Evidence]:
     """Per component its weighted sum of squares, and what of its freedom the data determine."""
-    weights, at_place = state.weights, terms.at_place / state.weights[:, 1:, None, None]
-    squared = weights * terms.squared(*found.displacements(state.shared, at_place))
-    of_u, of_v = found.covariances(window.covariance_of_shown, at_place)
-    open_u = np.trace(terms.cloud @ of_u, axis1=1, axis2=2) * weights[:, 0]
-    open_v = np.trace(np.linalg.solve(at_place, of_v), axis1=2, axis2=3)
+    weights = state.weights
+    squared = weights * terms.squared(*found.displacements(state.shared))
+    open_u, open_v = found.open_freedom(window.covariance_of_shown)
     present, parts = weights[:, 1:][terms.seen], window.model.components
     model, known, distortions = window.model, 0.0, 0
     if model.is_distorted:  # its residuals count as a part of its prior

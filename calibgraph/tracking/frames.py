@@ -39,7 +39,6 @@ from calibgraph.model.correspondences import (
 )
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.places import PLACES
-from calibgraph.model.rig import Rig
 from calibgraph.solver.preprocess import REPEATED_SHARE, with_common_error
 from calibgraph.tracking.state import State
 
@@ -272,7 +271,7 @@ def prepared(state: State, frame: StreamFrame, last: int | None) -> StreamFrame:
         )
     table = with_common_error(frame.table, state.config)
     if len(table):
-        table = _with_motion_in_use(state.rig, table, state.knows_motion)
+        _require_same_motion(state, table)
         if stamp is None and table.stamp_ns is not None:
             stamp = int(table.stamp_ns.max())
     return StreamFrame(number, table, stamp, _place_of(frame))
@@ -307,18 +306,9 @@ def _place_of(frame: StreamFrame) -> str:
     return name
 
 
-def _with_motion_in_use(rig: Rig, table: Correspondences, before: bool | None) -> Correspondences:
-    """The matches of a frame, with the motion of the LiDAR if all frames have it.
-
-    Args:
-        rig: with the clocks of its cameras.
-        table: the matches.
-        before: whether that of earlier frames is known; None if there are none.
-
-    Raises:
-        CorrespondenceError: if it is known of some frames alone.
-    """
-    known = table.twist_per_s is not None
+def _require_same_motion(state: State, table: Correspondences) -> None:
+    """Refuse a frame that has the motion of the LiDAR where earlier ones do not, or has none."""
+    known, before = table.twist_per_s is not None, state.knows_motion
     if before is not None and before != known:
         found, earlier = ("no ", "one") if not known else ("a ", "none")
         raise CorrespondenceError(
@@ -326,8 +316,7 @@ def _with_motion_in_use(rig: Rig, table: Correspondences, before: bool | None) -
             "clocks need it with every frame: give it or leave it out"
         )
     if before is None:
-        unused_times(rig, is_known=known, how=f"{OF_IMAGES}, {OF_TABLES}")
-    return table
+        unused_times(state.rig, is_known=known, how=f"{OF_IMAGES}, {OF_TABLES}")
 
 
 def repeated_cameras(state: State, table: Correspondences) -> list[int]:
@@ -349,7 +338,7 @@ def _last_points(state: State, camera: int) -> Array | None:
     """(n, 3) of the last frame, absorbed or, before the camera has started, waiting."""
     if waiting := state.waiting[camera]:
         return waiting[-1].of_camera(state.names[camera]).points_lidar_m
-    if not state.blocks[camera]:
+    if not state.matches[camera]:
         return None
-    last = state.blocks[camera][-1]
+    last = state.matches[camera][-1].raw
     return last.block.points_lidar_m[last.frame_edges[-2] :]

@@ -15,8 +15,7 @@ anchors, and the steps from there are tested at every new epoch.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import gtsam
@@ -27,26 +26,26 @@ from calibgraph.model.geometry import adjoints, invert, pose_rows, retract_all
 from calibgraph.solver.components import pose_covariance
 from calibgraph.solver.matches import MIN_MATCHES, CameraBlock, merge
 from calibgraph.solver.within_place import WEAK
-from calibgraph.tracking.absorption import absorb_again
+from calibgraph.tracking.absorption import absorb_again, sums_of
 from calibgraph.tracking.cause import (
     CLEARLY,
-    Cause,
     Steps,
     add_epoch,
     alarm_limit,
     find_cause,
+    inflation,
     squared_sigmas,
     unexplained,
 )
-from calibgraph.tracking.eliminate import block_diagonal
-from calibgraph.tracking.events import Event, Size
-from calibgraph.tracking.gate import Gated, agrees, refine, sums_of
-from calibgraph.tracking.state import STRENGTHS, DriftWatch, OutlierFrame, State, rows_of
-from calibgraph.tracking.sums import Sums
+from calibgraph.tracking.events import Event, Kind, Size
+from calibgraph.tracking.gate import Gated, refine
+from calibgraph.tracking.state import STRENGTHS, DriftWatch, State, rows_of
+from calibgraph.tracking.sums import Sums, block_diagonal, diagonal_blocks
 from factors import to_runs
 from factors.pose_kernel import logarithms
 
 Scatters = Mapping[int, Array]
+Measured = tuple[Steps, Array]
 
 
 def steps_between(
@@ -54,7 +53,7 @@ def steps_between(
     before: tuple[Sums, Scatters],
     after: tuple[Sums, Scatters],
     by_places: Array | None = None,
-) -> tuple[Steps, dict[int, Array]]:
+) -> Measured:
     """The steps of all cameras that are determined in both sets of frames.
 
     Args:
@@ -65,7 +64,7 @@ def steps_between(
         by_places: (6 n, 6 n) covariance of the steps by what places share.
 
     Returns:
-        The steps; per such camera the step from its reference to where it is after.
+        The steps; (n, 6) from the reference of each such camera to where it is after.
     """
     one, two = before[0], after[0]
     cameras = np.flatnonzero(one.are_determined & two.are_determined).tolist()
@@ -77,16 +76,13 @@ def steps_between(
         ends.append(-(inverse @ sums.gradient[cameras][..., None])[..., 0])
         flat = block_diagonal(np.asarray(inverse))
         covariance += flat @ _scatter(state, sums.frames, own)[np.ix_(rows, rows)] @ flat
-    inflation = np.repeat([math.sqrt(state.inflation(camera)) for camera in cameras], 6)
-    covariance *= np.outer(inflation, inflation)
+    ratio = np.repeat(np.sqrt(inflation(state.groups[cameras])), 6)
+    covariance *= np.outer(ratio, ratio)
     if by_places is not None:
         covariance += by_places[np.ix_(rows, rows)]
-    limits = alarm_limit(state.total_frames[cameras])
-    apart = np.ravel(ends[1] - ends[0])
-    return (
-        Steps(tuple(cameras), apart, covariance, limits, state.references[cameras]),
-        dict(zip(cameras, ends[1], strict=True)),
-    )
+    limits, now = alarm_limit(state.total_frames[cameras]), np.zeros_like(one.gradient)
+    apart, now[cameras] = np.ravel(ends[1] - ends[0]), ends[1]
+    return Steps(tuple(cameras), apart, covariance, limits, state.references[cameras]), now
 
 
 def _scatter(state: State, frames: Array, own: Scatters) -> Array:
@@ -176,17 +172,20 @@ def report_drift(state: State) -> list[Event]:
     if abs(by_lidar - by_camera) < CLEARLY and waited < _REPORT and len(steps.cameras) > 1:
         return []
     cause = find_cause(steps, found_by={watch.camera})
-    if cause.lidar:
-        name, size = None, Size.of(*cause.lidar)
-    else:
-        name = state.names[watch.camera]
-        size = Size.of(*steps.of(steps.cameras.index(watch.camera)))
-    event = Event("drifts", name, watch.frame, state.frame or 0, state.stamp_ns, size)
-    for camera in range(len(state.names)) if cause.lidar else (watch.camera,):
-        state.put(camera, drift_reported_at=state.updates)
+    camera = None if cause.lidar else watch.camera
+    size = Size.of(*(cause.lidar or steps.of(watch.camera)))
+    event = _event(state, "drifts", watch.frame, (camera, size))
+    for drifting in range(len(state.names)) if camera is None else (camera,):
+        state.put(drifting, drift_reported_at=state.updates)
     state.drift = None
     state.with_moves([event])
     return [event]
+
+
+def _event(state: State, kind: Kind, since: int, found: tuple[int | None, Size]) -> Event:
+    """Of a camera, or of the LiDAR."""
+    name = None if found[0] is None else state.names[found[0]]
+    return Event(kind, name, since, state.frame or 0, state.stamp_ns, found[1])
 
 
 def update_evidence(state: State, epoch: Sums, by_places: Array) -> None:
@@ -194,26 +193,18 @@ def update_evidence(state: State, epoch: Sums, by_places: Array) -> None:
 
     The scatter of epochs is updated here too: by now, a move within the epoch has been detected.
     """
-    noises = {}
-    for camera in np.flatnonzero(epoch.frames).tolist():
-        alone, noise = state.scatter_of_frames(camera), state.frame_noise(camera)
-        if noise is None or alone is None:
-            continue
-        score, frames = epoch.score[camera], float(epoch.frames[camera])
-        state.put(camera, groups=add_epoch(state.groups[camera], score, frames, alone))
-        if (state.walks.frames[camera] >= _LEAST_FRAMES).all():
-            own, hessian = pose_rows(camera), epoch.hessian[camera]
-            noises[camera] = noise * frames + hessian @ by_places[own, own] @ hessian
-    if not noises:
-        return
-    cameras = [*noises]
-    walks, seen = state.walks[cameras], epoch[cameras].hessian[:, None]
-    steps = np.linalg.solve(walks.hessian, -walks.gradient[..., None])
-    score = epoch.gradient[cameras][:, None, :, None] + seen @ steps
-    spread = np.linalg.solve(walks.hessian, seen)
-    covariance = np.array([*noises.values()])[:, None]
-    covariance = covariance + spread.swapaxes(-1, -2) @ walks.scatter @ spread
-    distance = (score * np.linalg.solve(covariance, score)).sum(axis=(-1, -2))
+    cameras = np.flatnonzero((epoch.frames > 0) & state.is_known)
+    own, noise, groups = epoch[cameras], state.frame_noise, state.groups.copy()
+    alone = state.scatter_of_frames[cameras]
+    groups[cameras] = add_epoch(groups[cameras], own.score, own.frames, alone)
+    state.groups = groups
+    cameras = cameras[(state.walks.frames[cameras] >= _LEAST_FRAMES).all(axis=1)]
+    own = epoch[cameras]
+    score, by_walk = _predict(state.walks[cameras], own[:, None])
+    of_places = own.hessian @ diagonal_blocks(by_places)[cameras] @ own.hessian
+    of_frames = noise[cameras] * own.frames[:, None, None] + of_places
+    covariance = of_frames[:, None] + by_walk
+    distance = (score * np.linalg.solve(covariance, score[..., None])[..., 0]).sum(axis=-1)
     logarithm = np.linalg.slogdet(covariance)[1]
     logarithm -= logarithm.min(axis=1, keepdims=True)
     gain = -0.5 * (np.minimum(distance, _DISTANCE_CAP) + logarithm)
@@ -274,7 +265,7 @@ class DetectedStep:
 
     since: int
     found_by: frozenset[int]
-    outlier_frames: Mapping[int, tuple[OutlierFrame, ...]] = field(default_factory=dict)
+    outlier_frames: Mapping[int, tuple[Gated, ...]] = field(default_factory=dict)
 
 
 def detect_step(state: State) -> DetectedStep | None:
@@ -304,13 +295,13 @@ def detect_step(state: State) -> DetectedStep | None:
     return DetectedStep(since, frozenset(found_by), clusters)
 
 
-def _cluster(state: State, camera: int) -> tuple[OutlierFrame, ...]:
+def _cluster(state: State, camera: int) -> tuple[Gated, ...]:
     """The outlier frames that agree with the newest one; a single one is no evidence."""
     if not state.outliers[camera]:
         return ()
-    T = state.outliers[camera][-1].T_camera_lidar
-    near = tuple(one for one in state.outliers[camera] if agrees(state, camera, one.raw, T))
-    return near if len(near) > 1 else ()
+    T, scale, share = state.outliers[camera][-1].poses[0], state.scales[camera], state.share[camera]
+    near = [one for one in state.outliers[camera] if Gated.at(T, one.raw, scale).agrees(share)]
+    return tuple(near) if len(near) > 1 else ()
 
 
 def _count_agreeing(state: State, camera: int, since: int) -> int:
@@ -335,23 +326,24 @@ def detect_small_step(state: State) -> DetectedStep | None:
     if any(_is_pending(state, camera) for camera in range(len(state.names))):
         return None
     edges, detected, best = state.edges, None, 1.0
-    after = Sums(np.cumsum(state.sums_of_epochs()[::-1], axis=0)[::-1])
-    before = Sums.stack(state.sums_before_epochs()[:-1])
+    after = Sums(np.cumsum(state.sums_of_epochs().packed[::-1], axis=0)[::-1])
+    before = state.sums_before_epochs()[:-1]
     ready = state.started & (state.groups[:, 0] >= _LEAST_EPOCHS)
     tested = (before.frames >= _BEFORE) & (after.frames > 0) & ready
     tested &= np.array(state.sizes)[:, None] > 0
     tested[0] = False
     tested[tested] = before[tested].are_determined
     begun, cameras = (index.tolist() for index in np.nonzero(tested))
-    score, covariance = _scores(before[tested], after[tested])
-    inflations = np.array([*map(state.inflation, range(len(state.names)))])
-    covariance *= inflations[cameras][:, None, None]
-    limits = alarm_limit(before.frames[tested])
+    before, later = before[tested], after[tested]
+    score, covariance = _predict(before, later)
+    covariance += before.scatter * (later.frames / (before.frames - 1))[:, None, None]
+    covariance *= inflation(state.groups[cameras])[:, None, None]
+    limits = alarm_limit(before.frames)
     sigmas = np.linalg.solve(covariance, score[..., None])[..., 0]
     excess = (score * sigmas).sum(axis=1) / limits
     for row in np.flatnonzero(excess > 1.0):
         camera, first = cameras[row], edges[begun[row]]
-        own, hessian = pose_rows(camera), after.hessian[begun[row], camera]
+        own, hessian = pose_rows(camera), later.hessian[row]
         if excess[row] > best:  # by what places share it is less still
             by_places = hessian @ shift_between(state, first)[own, own] @ hessian
             squared = squared_sigmas(score[row], covariance[row] + by_places)
@@ -361,20 +353,16 @@ def detect_small_step(state: State) -> DetectedStep | None:
     return detected
 
 
-def _scores(before: Sums, after: Sums) -> tuple[Array, Array]:
-    """(k, 6) gradients of the frames after, at the minimum of those before.
+def _predict(before: Sums, after: Sums) -> tuple[Array, Array]:
+    """(..., 6) gradients of the frames after, at the minimum of those before.
 
-    Further (k, 6, 6) their covariances by scatter.
+    Further (..., 6, 6) their covariances by that minimum's.
     """
-    inverse = np.linalg.inv(before.hessian)
+    spread = np.linalg.solve(before.hessian, after.hessian)
     step = np.linalg.solve(before.hessian, -before.gradient[..., None])
     score = after.gradient + (after.hessian @ step)[..., 0]
-    by_estimate = after.hessian @ (inverse @ before.scatter @ inverse) @ after.hessian
-    frames = after.frames / (before.frames - 1)
-    return score, before.scatter * frames[:, None, None] + by_estimate
+    return score, spread.swapaxes(-1, -2) @ before.scatter @ spread
 
-
-Measured = tuple[Steps, dict[int, Array]]
 
 _RECENTLY = 300  # frames: a second small step within them is a drift
 _GUESSED_OVERCONFIDENCE = 100.0  # of H, while the frames' scatter is not known
@@ -402,24 +390,26 @@ def restart_after_step(state: State, detected: DetectedStep) -> list[Event]:
     """Restart the cameras that have moved in a step; the events."""
     detected, (steps, now) = _date_step(state, detected)
     cause = find_cause(steps, detected.found_by)
-    events = _make_events(state, detected.since, steps, cause)
-    moved = [*cause.cameras]
-    to = retract_all(
-        state.references[moved], np.array([now[camera] for camera in moved]).reshape(-1, 6)
-    )
-    targets = dict(zip(moved, to, strict=True))
+    found = {None: cause.lidar} if cause.lidar else {c: steps.of(c) for c in cause.cameras}
+    events = [
+        _event(state, "moved", detected.since, (who, Size.of(*step))) for who, step in found.items()
+    ]
+    to = retract_all(state.references, now)
+    targets = {camera: to[camera] for camera in cause.cameras}
     if cause.lidar:
         by = invert(gtsam.Pose3.Expmap(cause.lidar[0]).matrix())
         others = set(range(len(state.names))) - set(targets)
         targets |= {camera: state.references[camera] @ by for camera in others}
     for camera in detected.found_by - set(steps.cameras):  # nothing to compare with
         if near := detected.outlier_frames.get(camera):
-            targets[camera] = near[-1].T_camera_lidar
+            targets[camera] = near[-1].poses[0]
     for camera, T_camera_lidar in targets.items():
-        blocks = _blocks_since(state, detected, camera)
-        _restart_camera(state, camera, T_camera_lidar, blocks)
-    if not cause.lidar:
-        _drop_pairs_of(state, targets)
+        _restart_camera(state, detected, camera, T_camera_lidar)
+    if not cause.lidar:  # the relative poses of cameras that moved alone are wrong
+        moved = {state.names[camera] for camera in targets}
+        pairs = enumerate(state.rig.relative_poses)
+        wrong = {place for place, pair in pairs if moved & {pair.a, pair.b}}
+        state.dropped_pairs = tuple(sorted({*state.dropped_pairs} | wrong))
     state.with_moves(events)
     return events
 
@@ -433,9 +423,10 @@ def _date_step(state: State, detected: DetectedStep) -> tuple[DetectedStep, Meas
     found_by = [camera for camera in detected.found_by if camera in steps.cameras]
     numbers, gain = state.numbers.tolist(), np.full(len(state.numbers), np.nan)
     for camera in found_by:
-        step, _ = steps.of(steps.cameras.index(camera))
-        raw = merge(_blocks_since(state, replace(detected, since=numbers[0]), camera))
-        ends, runs = np.stack([now[camera] - step, now[camera]]), to_runs(raw.frame_edges)
+        raw = _matches_since(state, replace(detected, since=numbers[0]), camera)
+        assert raw is not None  # by which it is found
+        ends = np.stack([now[camera] - steps.of(camera)[0], now[camera]])
+        runs = to_runs(raw.frame_edges)
         before, after = (
             raw.with_scale(state.scales[camera]).summarize(np.tile(T, (len(runs), 1, 1)), runs).cost
             for T in retract_all(np.tile(state.references[camera], (2, 1, 1)), ends)
@@ -457,25 +448,14 @@ def _date_step(state: State, detected: DetectedStep) -> tuple[DetectedStep, Meas
     return detected, measured
 
 
-def _make_events(state: State, since: int, steps: Steps, cause: Cause) -> list[Event]:
-    def event(camera: str | None, size: Size) -> Event:
-        return Event("moved", camera, since, state.frame or 0, state.stamp_ns, size)
-
-    if cause.lidar:
-        return [event(None, Size.of(*cause.lidar))]
-    return [
-        event(state.names[camera], Size.of(*steps.of(steps.cameras.index(camera))))
-        for camera in cause.cameras
-    ]
-
-
 def _restart_camera(
-    state: State, camera: int, T_camera_lidar: Array, blocks: list[CameraBlock]
+    state: State, detected: DetectedStep, camera: int, T_camera_lidar: Array
 ) -> None:
     """Restart a camera at T_camera_lidar from the frames since it moved."""
-    set_aside = {one.number for one in state.outliers[camera]}
-    left = sum(1 for raw in blocks for n in raw.frame_numbers.tolist() if n in set_aside)
-    state.count(camera, left_out=-left)
+    raw = _matches_since(state, detected, camera)
+    if raw is not None:
+        set_aside = [one.number for one in state.outliers[camera]]
+        state.count(camera, left_out=-int(np.isin(raw.frame_numbers, set_aside).sum()))
     (step,) = logarithms((state.references[camera] @ invert(T_camera_lidar))[None])
     drift = state.drift
     if drift is not None:
@@ -485,42 +465,33 @@ def _restart_camera(
     state.places = state.places.without(camera)
     state.put(
         camera,
-        blocks=(), inliers=(), outliers=(), agreements=(), moved_at=state.updates, absent=0,
+        matches=(), outliers=(), agreements=(), moved_at=state.updates, absent=0,
         walks=Sums.zeros(len(STRENGTHS)), evidence=0.0, walk=0,
     )  # fmt: skip
-    absorb_again(state, camera, blocks, T_camera_lidar)
+    absorb_again(state, camera, raw, T_camera_lidar)
 
 
-def _drop_pairs_of(state: State, cameras: Iterable[int]) -> None:
-    """Drop the relative poses of cameras that moved alone."""
-    wrong = [
-        place
-        for place, pair in enumerate(state.rig.relative_poses)
-        if any(state.names[c] in (pair.a, pair.b) for c in cameras)
-    ]
-    state.dropped_pairs = tuple(sorted({*state.dropped_pairs, *wrong}))
-
-
-def _blocks_since(state: State, detected: DetectedStep, camera: int) -> list[CameraBlock]:
-    """A camera's matches in the frames since a step, including those set aside."""
+def _matches_since(state: State, detected: DetectedStep, camera: int) -> CameraBlock | None:
+    """A camera's matches in the frames since a step, including those set aside; None: no frame."""
     own, outliers = state.matches_of(camera), detected.outlier_frames.get(camera, ())
-    kept = [] if own is None else [own[0].select(own[0].frame >= detected.since)]
-    kept += [one.raw for one in outliers if one.number >= detected.since]
-    return [raw for raw in kept if len(raw)]
+    parts = [one.raw for one in (*(() if own is None else (own,)), *outliers)]
+    kept = [raw.select(raw.frame >= detected.since) for raw in parts]
+    if not sum(map(len, kept)):
+        return None
+    raw = merge([raw for raw in kept if len(raw)])
+    return raw.select(np.argsort(raw.frame, kind="stable"))
 
 
 def _sums_since(state: State, detected: DetectedStep) -> Sums:
     """The sums over the frames since a step, linearized at the estimate that fits them."""
     found = Sums.zeros(len(state.names))
     for camera in np.flatnonzero(state.started).tolist():
-        parts = _blocks_since(state, detected, camera)
-        if not parts:
+        raw = _matches_since(state, detected, camera)
+        if raw is None:
             continue
-        near = detected.outlier_frames.get(camera, ())
-        start = near[-1].T_camera_lidar if near else state.references[camera]
-        raw, scale = merge(parts), state.scales[camera]
-        T = refine(raw, start, scale, state.config)
-        gated = Gated.at(T, raw, scale)
+        near, scale = detected.outlier_frames.get(camera, ()), state.scales[camera]
+        start = near[-1].poses[0] if near else state.references[camera]
+        gated = Gated.at(refine(raw, start, scale, state.config), raw, scale)
         if gated.counts.sum() >= MIN_MATCHES:
             found = found.replace_at(camera, sums_of(state, {camera: gated}).total())
     return found
@@ -529,7 +500,7 @@ def _sums_since(state: State, detected: DetectedStep) -> Sums:
 def _measure_steps(state: State, detected: DetectedStep) -> Measured:
     """The steps of the cameras; and per camera its estimate now, from its reference."""
     before, after = state.all_sums(detected.since), _sums_since(state, detected)
-    new = [c for c in range(len(state.names)) if state.frame_noise(c) is None]
+    new = np.flatnonzero(~state.is_known).tolist()
     guessed = {camera: after.hessian[camera] * _GUESSED_OVERCONFIDENCE for camera in new}
     own = {camera: before.scatter[camera] for camera in (*new, *state.drifting)}
     by_places = shift_between(state, state.first_row(detected.since))

@@ -20,13 +20,12 @@ from calibgraph.graph.components import VarianceRatios
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.findings import MatcherFindings
-from calibgraph.model.geometry import pose_rows
 from calibgraph.model.rig import Rig
-from calibgraph.solver.matches import CameraBlock, merge
 from calibgraph.solver.robust import ResidualScale
 from calibgraph.tracking.cause import inflation
 from calibgraph.tracking.events import Event
-from calibgraph.tracking.sums import Numbers, PlaceSums, Sums
+from calibgraph.tracking.gate import Gated
+from calibgraph.tracking.sums import Numbers, PlaceSums, Sums, diagonal_blocks
 
 Item = TypeVar("Item")
 
@@ -41,21 +40,6 @@ BEND = 66
 """Numbers of a camera's matches in the scan distortion: (6, 6) Hessian, (6, 3) the same times the
 displacement by a unit of each, (3, 3) information and (3,) vector of the residuals."""
 _MOST_MOVES = 100  # that are kept
-
-
-@dataclass(frozen=True, eq=False)
-class OutlierFrame:
-    """A frame that disagrees with a camera's estimate but fits another T_camera_lidar.
-
-    Attributes:
-        number: of the frame.
-        raw: its matches.
-        T_camera_lidar: (4, 4) that fits them.
-    """
-
-    number: int
-    raw: CameraBlock
-    T_camera_lidar: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,9 +76,8 @@ class State:
         at: (R,) names of their places; empty: not known.
         sizes: (E,) frames of each epoch; the last is open.
         sums: (R, n) of their inliers.
-        blocks: per camera, its matches that were absorbed, in order, in some blocks.
-        inliers: which of them are within the gate.
-        poses: (E, n, 4, 4) T_camera_lidar of each epoch; that of a drifting camera is its own.
+        matches: per camera, those that were absorbed, in order; of a drifting one, each epoch is
+            gated at an estimate of its own.
         places: sums of the older frames, place by place, of cameras that do not drift.
         settled: names of the places whose optimum is known, as of the begin of the epoch.
         steps: (P, n, 6) from the references to where matches at these show the cameras.
@@ -120,15 +103,14 @@ class State:
         counts: (n, 6) see COUNTS.
         waiting: per camera, before it has started, the frames it may start from.
         refused: why it has not started from them.
-        outliers: its last frames that disagree with the estimate but fit another one.
+        outliers: its last frames that disagree with the estimate, each at another that it fits.
         agreements: of its last frames, the number, and whether it agreed.
         dropped_pairs: places in ``rig.relative_poses`` of pairs that a move has invalidated.
         contradicting: of those that contradict the correspondences, and take no part.
         drift: whose cause is not clear yet, or None.
         findings: of the errors that frames share, by their matcher.
         ratios: of these, as the data show them, over what the matcher states.
-        frame: number of the last frame, or None.
-        stamp_ns: its time, or None.
+        stamp_ns: time of the last frame, or None.
         updates: number of updates.
         moves: the last events of moves and drifts.
         knows_motion: whether the motion of frames is known; None before the first.
@@ -141,9 +123,7 @@ class State:
     at: tuple[str, ...]
     sizes: tuple[int, ...]
     sums: Sums
-    blocks: tuple[tuple[CameraBlock, ...], ...]
-    inliers: tuple[tuple[Mask, ...], ...]
-    poses: Array
+    matches: tuple[tuple[Gated, ...], ...]
     places: PlaceSums
     settled: tuple[str, ...]
     steps: Array
@@ -169,14 +149,13 @@ class State:
     counts: Numbers
     waiting: tuple[tuple[Correspondences, ...], ...]
     refused: tuple[tuple[str, ...], ...]
-    outliers: tuple[tuple[OutlierFrame, ...], ...]
+    outliers: tuple[tuple[Gated, ...], ...]
     agreements: tuple[tuple[tuple[int, bool], ...], ...]
     dropped_pairs: tuple[int, ...] = ()
     contradicting: tuple[int, ...] = ()
     drift: DriftWatch | None = None
     findings: MatcherFindings = field(default_factory=MatcherFindings)
     ratios: VarianceRatios = VarianceRatios()
-    frame: int | None = None
     stamp_ns: int | None = None
     updates: int = 0
     moves: tuple[Event, ...] = ()
@@ -201,9 +180,7 @@ class State:
             at=(),
             sizes=(0,),
             sums=Sums.zeros(0, n),
-            blocks=none,
-            inliers=none,
-            poses=guess[None],
+            matches=none,
             places=PlaceSums.empty(n),
             settled=(),
             steps=np.zeros((0, n, 6)),
@@ -258,14 +235,15 @@ class State:
         for name, number in more.items():
             self.counts[camera, COUNTS.index(name)] += number
 
-    def counted(self, camera: int, name: str) -> int:
-        """A count of a camera."""
-        return int(self.counts[camera, COUNTS.index(name)])
-
     @property
     def names(self) -> tuple[str, ...]:
         """The cameras' names."""
         return tuple(self.rig.cameras)
+
+    @property
+    def frame(self) -> int | None:
+        """Number of the last frame, None before the first."""
+        return int(self.numbers[-1]) if len(self.numbers) else None
 
     @property
     def closed(self) -> int:
@@ -283,17 +261,18 @@ class State:
         found: list[int] = self.walk.nonzero()[0].tolist()
         return found
 
-    def matches_of(self, camera: int) -> tuple[CameraBlock, Mask] | None:
-        """A camera's matches in all frames, and which are within the gate; None if it has none.
-
-        They are joined, and remain so.
-        """
-        if not self.blocks[camera]:
+    def matches_of(self, camera: int) -> Gated | None:
+        """A camera's matches in all frames; None if it has none. They are joined, and remain so."""
+        if not self.matches[camera]:
             return None
-        if len(self.blocks[camera]) > 1:
-            joined = merge(self.blocks[camera]), np.concatenate(self.inliers[camera])
-            self.put(camera, blocks=joined[:1], inliers=joined[1:])
-        return self.blocks[camera][0], self.inliers[camera][0]
+        if len(self.matches[camera]) > 1:
+            self.put(camera, matches=(Gated.join(self.matches[camera]),))
+        return self.matches[camera][0]
+
+    def settled_rows(self, names: Iterable[str]) -> Numbers:
+        """(k,) which of the places with a known optimum they are; -1: of none."""
+        row_of = dict(zip(self.settled, range(len(self.settled)), strict=True))
+        return np.array([row_of.get(name, -1) for name in names], dtype=np.int64)
 
     def first_row(self, number: int) -> int:
         """The first of the frames that is not before a number."""
@@ -314,43 +293,40 @@ class State:
         whole = np.repeat([rotation, tracking.walk_translation_m**2], 3) * frames
         return np.outer(strengths**2, whole)
 
-    def inflation(self, camera: int) -> float:
-        """Ratio of the scatter of a camera's epochs to that of their frames, at least 1."""
-        return inflation(self.groups[camera])
+    @property
+    def is_known(self) -> Mask:
+        """(n,) whether the scatter of a camera's frames is."""
+        return np.asarray(self.total_frames >= LEAST_FRAMES)
 
-    def scatter_of_frames(self, camera: int) -> Array | None:
-        """(6, 6) scatter of one frame's gradient, by frames alone; None while it is unknown."""
-        frames = self.total_frames[camera]
-        if frames < LEAST_FRAMES:
-            return None
-        rows = pose_rows(camera)
-        return np.asarray(self.total[rows, rows] / (frames - 1))
+    @property
+    def scatter_of_frames(self) -> Array:
+        """(n, 6, 6) scatter of one frame's gradient, by frames alone, where it is known."""
+        frames = np.maximum(self.total_frames - 1, 1.0)
+        return diagonal_blocks(self.total) / frames[:, None, None]
 
-    def frame_noise(self, camera: int) -> Array | None:
-        """The same times the inflation."""
-        noise = self.scatter_of_frames(camera)
-        return None if noise is None else noise * self.inflation(camera)
+    @property
+    def frame_noise(self) -> Array:
+        """(n, 6, 6) the same times the inflation: the ratio of the scatter of epochs to theirs."""
+        return self.scatter_of_frames * inflation(self.groups)[:, None, None]
 
     @property
     def overconfidence(self) -> Array:
         """(n,) mean ratio of each camera's Hessian to its information, at least 1."""
-        found = np.ones(len(self.names))
-        for camera in np.flatnonzero(self.total_frames >= LEAST_FRAMES).tolist():
-            rows = pose_rows(camera)
-            share = np.linalg.solve(self.total_hessian[camera], self.total[rows, rows])
-            found[camera] = max(1.0, float(np.trace(share)) / 6)
+        found, known = np.ones(len(self.names)), self.is_known
+        share = np.linalg.solve(self.total_hessian[known], diagonal_blocks(self.total)[known])
+        found[known] = np.maximum(np.trace(share, axis1=1, axis2=2) / 6, 1.0)
         return found
 
     # Sums over epochs, older ones discounted by the random walk of a camera that drifts.
 
-    def sums_of_epochs(self, before: int | None = None) -> list[Array]:
-        """(E,) packed sums of each epoch, of frames before a number."""
+    def sums_of_epochs(self, before: int | None = None) -> Sums:
+        """(E, n) of each epoch, of frames before a number."""
         end = len(self.numbers) if before is None else self.first_row(before)
-        edges, packed = np.minimum(self.edges, end).tolist(), self.sums.packed
-        return [np.add.reduce(packed[first:last], axis=0) for first, last in pairwise(edges)]
+        edges = pairwise(np.minimum(self.edges, end).tolist())
+        return Sums(np.array([self.sums.packed[first:last].sum(axis=0) for first, last in edges]))
 
-    def sums_before_epochs(self, before: int | None = None) -> list[Sums]:
-        """(n,) over the frames before each epoch, the older ones too; and over all of them.
+    def sums_before_epochs(self, before: int | None = None) -> Sums:
+        """(E + 1, n) over the frames before each epoch, the older ones too; and over all of them.
 
         Args:
             before: number of a frame from which on none counts.
@@ -358,13 +334,13 @@ class State:
         sums = self.walks[np.arange(len(self.walk)), self.walk]
         of_epochs = self.sums_of_epochs(before)
         if not self.walk.any():
-            return [*map(Sums, np.cumsum([sums.packed, *of_epochs], axis=0))]
-        found = [sums]
-        for size, epoch in zip(self.sizes[:-1], of_epochs[:-1], strict=True):
+            return Sums(np.concatenate([sums.packed[None], of_epochs.packed]).cumsum(axis=0))
+        found = [sums.packed]
+        for epoch, size in zip(of_epochs.packed[:-1], self.sizes[:-1], strict=True):
             variance = self.walk_variance(STRENGTHS[self.walk], size)
-            sums = (sums + Sums(epoch)).after_walk(variance, self.overconfidence)
-            found.append(sums)
-        return [*found, sums + Sums(of_epochs[-1])]
+            sums = Sums(sums.packed + epoch).after_walk(variance, self.overconfidence)
+            found.append(sums.packed)
+        return Sums(np.array([*found, sums.packed + of_epochs.packed[-1]]))
 
     def all_sums(self, before: int | None = None) -> Sums:
         """(n,) over all frames, or those before a frame's number."""

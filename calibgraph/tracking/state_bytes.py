@@ -26,13 +26,14 @@ from calibgraph.solver.matches import CameraBlock
 from calibgraph.solver.robust import ResidualScale
 from calibgraph.tracking.events import Event, Size
 from calibgraph.tracking.frames import StreamFrame
-from calibgraph.tracking.state import DriftWatch, OutlierFrame, State
+from calibgraph.tracking.gate import Gated
+from calibgraph.tracking.state import DriftWatch, State
 from calibgraph.tracking.sums import PlaceSums, Sums
 from factors import Lens, ProjectionBlock
 
 Kind = TypeVar("Kind")
 
-_MARK = b"calibgraph-tracker/18\n"
+_MARK = b"calibgraph-tracker/19\n"
 _BODY = len(_MARK) + hashlib.sha256().digest_size
 _DTYPES = ("<f8", "<f4", "<i8", "<i4", "|b1")
 
@@ -113,7 +114,7 @@ _KINDS: tuple[tuple[type, Callable[[Any], Any], Callable[[Any], Any]], ...] = (
     *((kind, lambda model: model.model_dump(mode="json"), kind.model_validate)
       for kind in (Rig, Config)),
     *((kind, _fields_of(kind), lambda held, kind=kind: kind(**held))
-      for kind in (State, DriftWatch, OutlierFrame, Sums, PlaceSums, MatcherFindings,
+      for kind in (State, DriftWatch, Gated, Sums, PlaceSums, MatcherFindings,
                    VarianceRatios, ResidualScale, Correspondences, CameraBlock, ProjectionBlock,
                    Lens, Event, Size, StreamFrame)),
 )  # fmt: skip

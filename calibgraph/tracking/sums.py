@@ -35,11 +35,7 @@ Numbers = NDArray[np.int64]
 
 _POSE = 6
 _SQUARE = _POSE * _POSE
-_PARTS = {
-    "hessian": _SQUARE, "reweighted": _SQUARE, "scatter": _SQUARE,
-    "gradient": _POSE, "score": _POSE, "frames": 1, "matches": 1,
-}  # fmt: skip
-_SIZE = sum(_PARTS.values())
+_SIZE = 3 * _SQUARE + 2 * _POSE + 2
 _LEAST_EIGENVALUE = 1e-9  # of the unit-diagonal Hessian: rounding noise is near 1e-15
 
 
@@ -54,13 +50,6 @@ class Sums:
     """
 
     packed: Array
-
-    @staticmethod
-    def of(**values: Array) -> Sums:
-        """Of all the properties."""
-        shape = values["frames"].shape
-        parts = [values[name].reshape(*shape, size) for name, size in _PARTS.items()]
-        return Sums(np.concatenate(parts, axis=-1))
 
     @staticmethod
     def zeros(*shape: int) -> Sums:
@@ -116,11 +105,6 @@ class Sums:
         outer = self.score[..., :, None] * self.score[..., None, :]
         return np.asarray(self.scatter - outer / whole)
 
-    @staticmethod
-    def stack(parts: Sequence[Sums]) -> Sums:
-        """The sums along a new first axis."""
-        return Sums(np.array([part.packed for part in parts]))
-
     def change(self, **values: Array) -> Sums:
         """The sums with other values of some properties."""
         found = Sums(self.packed.copy())
@@ -130,10 +114,6 @@ class Sums:
 
     def __add__(self, other: Sums) -> Sums:
         return Sums(self.packed + other.packed)
-
-    def __mul__(self, weight: Array) -> Sums:
-        """All of them times (...) weights."""
-        return Sums(self.packed * np.asarray(weight)[..., None])
 
     def __getitem__(self, index: Any) -> Sums:
         """A part of the leading axes."""
@@ -150,7 +130,7 @@ class Sums:
         return Sums(self.packed.sum(axis=0))
 
     def shift_reference(self, steps: Array) -> Sums:
-        """The sums about references that are moved by (..., 6) tangent steps."""
+        """The sums about references that are moved by (..., 6) tangent steps; axes broadcast."""
         moved = (self.hessian @ steps[..., None])[..., 0]
         return self.change(gradient=self.gradient + moved)
 
@@ -166,7 +146,7 @@ class Sums:
         hessian, back = gain @ hessian, gain.swapaxes(-1, -2)
         hessian = (hessian + hessian.swapaxes(-1, -2)) / 2
         kept = np.asarray(np.trace(gain, axis1=-2, axis2=-1) / _POSE)
-        return (self * kept).change(
+        return Sums(self.packed * kept[..., None]).change(
             hessian=hessian,
             gradient=(gain @ self.gradient[..., None])[..., 0],
             scatter=gain @ self.scatter @ back + hessian * variance[..., None, :] @ hessian,
@@ -211,6 +191,11 @@ class PlaceSums:
     def frames(self) -> Array:
         """(P, n) how many."""
         return self.rows.frames
+
+    @property
+    def visited(self) -> list[int]:
+        """The rows that have frames."""
+        return [*map(int, np.flatnonzero(self.frames.any(axis=1)))]
 
     @property
     def count(self) -> float:
@@ -296,3 +281,17 @@ class PlaceSums:
         part = own.change(score=np.zeros_like(own.score), reweighted=reweighted)
         none = Sums.zeros(1, len(self.means))
         return self.without(camera).add([name], none.replace_at((0, camera), part))
+
+
+def block_diagonal(blocks: Array) -> Array:
+    """(6 n, 6 n) from (n, 6, 6)."""
+    n = len(blocks)
+    matrix = np.zeros((n, 6, n, 6))
+    matrix[np.arange(n), :, np.arange(n)] = blocks
+    return matrix.reshape(6 * n, 6 * n)
+
+
+def diagonal_blocks(matrix: Array) -> Array:
+    """(n, 6, 6) of (6 n, 6 n)."""
+    n = len(matrix) // 6
+    return matrix.reshape(n, 6, n, 6)[np.arange(n), :, np.arange(n)]

@@ -34,12 +34,7 @@ from calibgraph.tracking.absorption import (
 )
 from calibgraph.tracking.assessment import Update, make_updates, to_calibration
 from calibgraph.tracking.epochs import close_epoch
-from calibgraph.tracking.estimate import (
-    EpochGraph,
-    Estimate,
-    contradicting,
-    settle,
-)
+from calibgraph.tracking.estimate import EpochGraph, Estimate, settle
 from calibgraph.tracking.events import Event
 from calibgraph.tracking.frames import StreamFrame, frame_of, prepared, repeated_cameras
 from calibgraph.tracking.gate import Gated
@@ -53,7 +48,8 @@ from calibgraph.tracking.state import State
 from calibgraph.tracking.state_bytes import StateError, decode, encode
 
 UNSOLVABLE = (RuntimeError, np.linalg.LinAlgError)  # what gtsam and numpy raise
-Taken = list[tuple[StreamFrame, list[Event], Mapping[int, int]]]
+Taken = tuple[StreamFrame, list[Event], Mapping[int, int]]
+"""A frame, the events detected with it, and of cameras that were used how many matches."""
 Outcome = list[Update] | CorrespondenceError
 """Updates of frames that were taken in at once, or why one frame is left out."""
 
@@ -147,11 +143,10 @@ class IncrementalCalibrator:
         Raises:
             CorrespondenceError: if the first cannot be taken in, as of :meth:`update`.
         """
-        group = self._alike(frames)
-        state = self._state.draft()
+        group, state = self._alike(frames), self._state.draft()
         try:
-            graph, taken = self._take_in(state, group)
-            graph, estimate = _estimated(state, graph)
+            taken = self._take_in(state, group)
+            estimate = self._solve(state)
             updates = make_updates(state, estimate, taken)
         except BaseException as error:
             self._graph = self._estimate = None
@@ -163,7 +158,7 @@ class IncrementalCalibrator:
                     frame=number,
                 ) from error
             raise
-        self._state, self._graph, self._estimate = state, graph, estimate
+        self._state, self._estimate = state, estimate
         return updates
 
     def _alike(self, frames: Sequence[StreamFrame]) -> list[StreamFrame]:
@@ -189,7 +184,7 @@ class IncrementalCalibrator:
             return group[:1]
         return group
 
-    def _take_in(self, state: State, group: Sequence[StreamFrame]) -> tuple[EpochGraph, Taken]:
+    def _take_in(self, state: State, group: Sequence[StreamFrame]) -> list[Taken]:
         """Absorb the matches that agree, set aside the others, detect events.
 
         Of half the frames, while one of them disagrees or a camera may start.
@@ -201,36 +196,40 @@ class IncrementalCalibrator:
             if state.started[camera]
         }
         usual = gated.keys() == blocks.keys()  # no camera may start
-        usual = usual and all(one.agree(state, camera).all() for camera, one in gated.items())
+        usual = usual and all(one.agrees(state.share[camera]) for camera, one in gated.items())
         if not usual and group[1:]:
             return self._take_in(state, group[: len(group) // 2])
         begin_frames(state, group)
-        graph, events = self._graph_of(state), list[Event]()
         if not usual:
-            gated = select_agreeing(state, graph, gated)
-        used = absorb(state, gated)[-len(group) :]
+            gated = select_agreeing(state, self._graph_of(state), gated)
+        absorb(state, gated)
+        used, events = state.sums.matches[-len(group) :], list[Event]()
         if not usual:
             events = start_cameras(state, table, blocks)
-        taken: Taken = []
-        for one, own in zip(group, used, strict=True):
+        taken = list[Taken]()
+        for one, counts in zip(group, used.tolist(), strict=True):
+            own = {camera: int(count) for camera, count in enumerate(counts) if count}
             count_repeats(state, one.table, repeated)
-            events += count_absent(state, own, one)
-            taken.append((one, events, own))
+            taken.append((one, events + count_absent(state, own, one), own))
             events = []
         detected = None if usual else detect_step(state)
         if detected is not None:  # moved so far that frames disagree with the estimate
             taken[-1][1].extend(restart_after_step(state, detected))
-        if state.sizes[-1] >= state.config.tracking.epoch_frames:
-            graph = self._close_epoch(state, taken[-1][1])
-        return graph, taken
+        if state.sizes[-1] >= state.config.tracking.epoch_frames:  # begin another one
+            taken[-1][1].extend(close_epoch(state, self._graph_of(state)))
+            detected = detect_small_step(state)
+            if detected is not None:
+                taken[-1][1].extend(handle_small_step(state, detected))
+            self._graph = settle(state)
+        return taken
 
-    def _close_epoch(self, state: State, events: list[Event]) -> EpochGraph:
-        """Begin another epoch, and test for a small step."""
-        events += close_epoch(state, self._graph_of(state))
-        detected = detect_small_step(state)
-        if detected is not None:
-            events += handle_small_step(state, detected)
-        return settle(state)
+    def _solve(self, state: State) -> Estimate:
+        """The optimum and marginal, without relative poses that contradict the correspondences."""
+        estimate = self._graph_of(state).solve(state)
+        if estimate.contradicting != state.contradicting:
+            state.contradicting = estimate.contradicting
+            estimate = self._graph_of(state).solve(state)
+        return estimate
 
     def _graph_of(self, state: State) -> EpochGraph:
         """The graph of the epoch of a state."""
@@ -269,18 +268,6 @@ class IncrementalCalibrator:
             return IncrementalCalibrator.from_bytes(require_file(Path(path)).read_bytes())
         except StateError as error:
             raise FileError(path, f"{error}; track anew from a rig") from error
-
-
-def _estimated(state: State, graph: EpochGraph) -> tuple[EpochGraph, Estimate]:
-    """The optimum and marginal, without the relative poses that contradict the correspondences."""
-    graph = graph if graph.is_of(state) else EpochGraph(state)
-    estimate = graph.solve(state)
-    dropped = contradicting(estimate.conflicts)
-    if dropped != state.contradicting:
-        state.contradicting = dropped
-        graph = EpochGraph(state)
-        estimate = graph.solve(state)
-    return graph, estimate
 
 
 def _columns(table: Correspondences) -> tuple[object, ...]:
@@ -328,9 +315,7 @@ def _preprocessed(
             block = camera_block(cameras[camera], usable.select(rows[first:end]), config)
             enough = block.frame_counts >= MIN_MATCHES
             if enough.any():
-                found[camera] = block
-                if not enough.all():
-                    found[camera] = block.select(np.repeat(enough, block.frame_counts))
+                found[camera] = block.select(np.repeat(enough, block.frame_counts))
     return group, table, repeated, found
 
 

@@ -37,7 +37,7 @@ class Window:
     """
 
     def __init__(self, model: LatentPoseModel, references: Array) -> None:
-        self.model, self.adjoint, cameras = model, adjoints(references), range(len(references))
+        self.model, cameras = model, range(len(references))
         self._poses, shared = [*map(to_T_lidar_camera, references)], gtsam.Values()
         self._keys, self._start = [CLOUD, *map(matched_key, cameras)], gtsam.Values()
         for key, pose in zip(self._keys, [gtsam.Pose3(), *self._poses], strict=True):
@@ -50,7 +50,8 @@ class Window:
             shared.insert(DISTORTION, np.zeros(model.components.distortion_jacobian.shape[2]))
         shared.insert(self._start)
         size = _POSE * len(cameras)
-        self._chain = np.hstack([-self.adjoint.reshape(-1, _POSE), np.eye(size)])
+        self.chain = np.hstack([-adjoints(references).reshape(-1, _POSE), np.eye(size)])
+        self._rounded = 1.0 + _ROUNDING * np.eye(_POSE + size)
         parameters = gtsam.ISAM2Params()
         parameters.setFactorization("QR")  # Cholesky takes sigmas 4096 times apart for singular
         parameters.setRelinearizeThreshold(_RELINEARIZE)
@@ -59,18 +60,17 @@ class Window:
         self._isam, self._all, self._slots = gtsam.ISAM2(parameters), shared, list[int]()
         self._isam.update(model.shared_graph, shared)
         for _ in range(2):
-            self.exchange(np.eye(size), np.zeros(size))
+            self.exchange(self.chain.T @ self.chain, np.zeros(_POSE + size))
 
-    def exchange(self, information: Array, vector: Array) -> None:
-        """Put a quadratic on the cameras, as matches show them, in the place of the one before.
+    def exchange(self, hessian: Array, gradient: Array) -> None:
+        """Put a quadratic on the cloud and the cameras in the place of the one before.
 
         Args:
-            information: (6 n, 6 n).
-            vector: (6 n,) the information times the minimum.
+            hessian: (6 + 6 n, 6 + 6 n).
+            gradient: (6 + 6 n,) at the references.
         """
-        hessian = self._chain.T @ information @ self._chain
-        hessian[np.diag_indices(len(hessian))] *= 1.0 + _ROUNDING
-        graph, whole = gtsam.NonlinearFactorGraph(), self._factor(hessian, self._chain.T @ vector)
+        graph = gtsam.NonlinearFactorGraph()
+        whole = self._factor(hessian * self._rounded, -gradient)
         graph.add(gtsam.LinearContainerFactor(whole, self._start))
         result = self._isam.update(graph, gtsam.Values(), self._slots)
         self._slots = [*result.getNewFactorsIndices()]
@@ -116,7 +116,7 @@ class Window:
     @property
     def covariance_of_shown(self) -> Array:
         """(6 n, 6 n) of :attr:`shown`."""
-        return np.asarray(self._chain @ self.covariance(self._keys) @ self._chain.T)
+        return np.asarray(self.chain @ self.covariance(self._keys) @ self.chain.T)
 
     @property
     def squared_errors(self) -> float:

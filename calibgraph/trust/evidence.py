@@ -83,16 +83,13 @@ class Evidence:
 
     @cached_property
     def joint_covariance(self) -> Array | None:
-        """(6 N, 6 N) by matches and images, the wider one, and by an unknown motion of the vehicle.
+        """(6 N, 6 N) by matches and images, the wider one, and by what is outside of both.
 
-        Cameras that are held are unknown.
+        That is an unknown motion of the vehicle, and the poses of other LiDARs. Cameras that are
+        held are unknown.
         """
         known = self.solution.covariance
-        return None if known is None else self._widen(known) + self._by_travel
-
-    @property
-    def _by_travel(self) -> Array:
-        return self.solution.travel @ self.solution.travel.T
+        return None if known is None else self._widen(known) + self.solution.outside
 
     def _widen(self, joint: Array) -> Array:
         """(6 N, 6 N): a covariance, widened where the images' evidence is flat."""
@@ -109,7 +106,7 @@ class Evidence:
         """The probability that its error is beyond the tolerance, by its posterior."""
         own, found = self.covariance_by_matches(camera), self.posteriors.get(camera)
         tolerance = self.solution.config.tolerance
-        if own is None or found is None or self.solution.travel.any():
+        if own is None or found is None or self.solution.outside.any():
             return probability_beyond(self.covariance_of(camera), tolerance)
         return found.probability_beyond(own, tolerance)
 
@@ -120,7 +117,7 @@ class Evidence:
     def covariance_by_matches(self, camera: str) -> Array | None:
         """(6, 6) of one camera, not widened by what the images leave open."""
         known = self.solution.covariance
-        return self._rows_of(None if known is None else known + self._by_travel, camera)
+        return self._rows_of(None if known is None else known + self.solution.outside, camera)
 
     def _rows_of(self, joint: Array | None, camera: str) -> Array | None:
         if joint is None or camera in self.solution.held:
@@ -134,7 +131,8 @@ class Evidence:
         if mount is None:
             return {}
         away = np.concatenate([twist_between(mount.T_camera_lidar[name], T[name]) for name in T])
-        joint = self._widen(mount.covariance + np.outer(away, away)) + self._by_travel
+        joint = self._widen(mount.covariance + np.outer(away, away))
+        joint += self.solution.outside
         return pair_covariances(joint, T, self.solution.held)
 
 

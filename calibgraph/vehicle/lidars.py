@@ -12,8 +12,8 @@ the covariance is wider by that.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Container, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import permutations
 
 import numpy as np
@@ -58,7 +58,8 @@ class LidarPoses:
         base: its name.
         T_base_lidar: per LiDAR, (4, 4): p_base = T_base_lidar * p_lidar.
         joint_covariance: (6 k, 6 k) of all but the base, in their order.
-        matched: per LiDAR, the share of its planes near others' that lie on them (0-1).
+        matched: per LiDAR, the share of its planes near others' that lie on them (0-1); not of one
+            that cameras place.
         places: instants between which the vehicle has moved.
         place_ratios: variance of rotation and translation between places over its prior.
     """
@@ -80,6 +81,15 @@ class LidarPoses:
         rows = [slice(6 * row, 6 * row + 6) for row in range(len(self.T_base_lidar) - 1)]
         names = [name for name in self.T_base_lidar if name != self.base]
         return {n: self.joint_covariance[of, of] for n, of in zip(names, rows, strict=True)}
+
+    def without(self, names: Container[str]) -> LidarPoses:
+        """The poses of the others."""
+        kept = [row for row, name in enumerate(self.covariance) if name not in names]
+        rows = [6 * row + axis for row in kept for axis in range(6)]
+        T = {name: own for name, own in self.T_base_lidar.items() if name not in names}
+        return replace(
+            self, T_base_lidar=T, joint_covariance=self.joint_covariance[np.ix_(rows, rows)]
+        )
 
 
 def calibrate_lidars(
@@ -133,7 +143,11 @@ def join_poses(parts: Sequence[LidarPoses], names: Sequence[str]) -> LidarPoses:
             for name in names
         },
         joint,
-        {name: min(p.matched[name] for p in parts if name in p.matched) for name in names},
+        {
+            name: min(p.matched[name] for p in parts if name in p.matched)
+            for name in names
+            if any(name in p.matched for p in parts)
+        },
         min(part.places for part in parts),
         (max(p.place_ratios[0] for p in parts), max(p.place_ratios[1] for p in parts)),
     )

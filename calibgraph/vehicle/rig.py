@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -73,7 +73,12 @@ class LidarResult:
 
 
 def calibrate_rig_lidars(
-    dataset: Dataset, rig: Rig, config: Config, *, progress: Progress
+    dataset: Dataset,
+    rig: Rig,
+    config: Config,
+    *,
+    place: Callable[[str], LidarPoses] | None = None,
+    progress: Progress,
 ) -> LidarResult:
     """The poses of a rig's LiDARs in its base, from clouds of instants.
 
@@ -84,6 +89,7 @@ def calibrate_rig_lidars(
         dataset: its frames have the clouds of all LiDARs; those that lack one are left out.
         rig: with the guess of each LiDAR, or none.
         config: the tolerance of the verdict.
+        place: finds by cameras a LiDAR with a guess that planes do not determine.
         progress: called with the stage, its steps done, and their number.
 
     Raises:
@@ -104,7 +110,7 @@ def calibrate_rig_lidars(
     progress("locating LiDARs", 0, 1)
     views = _look(instants, guess, rig.lidar)
     start, doubts, lost = locate_lidars(views, guess, base=rig.lidar)
-    parts = list[LidarPoses]()
+    parts, placed = list[LidarPoses](), dict[str, LidarPoses]()
     if lost:
         progress("joining LiDARs by motion", 0, 1)
         far = {name: T for name, T in guess.items() if name not in start}
@@ -115,11 +121,23 @@ def calibrate_rig_lidars(
         except CalibrationError:
             if len(known) < len(far):
                 raise
-            start, line = {**start, **known}, f"{lost}; begun from the guess"
+            placed, line = _placed(known, place), lost
+            if missing := known.keys() - placed.keys():
+                start, line = (
+                    {**start, **{n: known[n] for n in missing}},
+                    f"{lost}; begun from the guess",
+                )
         warnings.append(line)
     progress("calibrating LiDARs", 0, 1)
     if start:
-        parts.append(_solve(instants, views, start, base=rig.lidar))
+        found = _solve(instants, views, start, base=rig.lidar)
+        loose = [name for name in start if _loose(found.covariance[name], rig.lidar)]
+        placed |= _placed([name for name in loose if guess[name] is not None], place)
+        parts.append(found.without(placed))
+    if placed:
+        parts += placed.values()
+        seen = f"placed by cameras that see what it and {rig.lidar} see"
+        warnings.append(f"{', '.join(placed)}: {seen}")
     poses = join_poses(parts, [rig.lidar, *guess])
     clouds = _at_stamps(instants, poses.T_base_lidar)
     vehicle = None
@@ -139,6 +157,20 @@ def calibrate_rig_lidars(
         },
         tuple(warnings),
     )
+
+
+def _placed(
+    names: Iterable[str], place: Callable[[str], LidarPoses] | None
+) -> dict[str, LidarPoses]:
+    """The poses of LiDARs by cameras; without those that no camera is calibrated to."""
+    found = {}
+    for name in names:
+        try:
+            if place is not None:
+                found[name] = place(name)
+        except CalibrationError as error:
+            _log.info("%s", error)
+    return found
 
 
 def _look(
@@ -283,9 +315,9 @@ def judge_lidar(
     What counts data is in the error bar, and no sign of an error. The doubt is about the start:
     where another pose fits as well.
     """
-    covariance = poses.covariance[name]
+    covariance, by_planes = poses.covariance[name], name in poses.matched
     checks = [
-        threshold("lidar_matched").check(poses.matched[name]),
+        *([threshold("lidar_matched").check(poses.matched[name])] if by_planes else []),
         threshold("lidar_instants").check(poses.places),
         *(_loose(covariance, poses.base) or _wide(covariance, tolerance)),
     ]

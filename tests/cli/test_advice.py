@@ -16,7 +16,6 @@ import pytest
 import calibgraph
 from calibgraph import (
     CalibrationError,
-    Camera,
     Diagnosis,
     Rig,
     export_calibration,
@@ -24,6 +23,7 @@ from calibgraph import (
 )
 from tests.cli.conftest import save_problem
 from tests.conftest import KANNALA, SAMPLE, Call, make_camera, make_pair
+from tests.draws.lenses import put_lens_error
 from tests.io.bags.writing import Messages, Stamped, sample_messages, without, write_bag
 from tests.io.formats.calibration_files import CAMERA_INFO, KALIBR, KOIDE, URDF, write
 
@@ -124,8 +124,8 @@ def save_tables(folder: Path) -> None:
     shared = {"systematic_rotation_rad": 0.1, "systematic_translation_m": 1.0}
     replace(table, metadata={**table.metadata, **shared}).save(folder / "shared.parquet")
     Rig(cameras={**rig.cameras, "third": make_camera()}).save(folder / "three.yaml")
-    longer = {name: with_longer_lens(camera) for name, camera in rig.cameras.items()}
-    Rig(cameras=longer).save(folder / "long.yaml")
+    longer = put_lens_error(rig, "focal", 0.03)
+    longer.save(folder / "long.yaml")
     Rig(cameras={"eye": make_camera(model="fisheye", distortion=KANNALA)}).save(
         folder / "wide.yaml"
     )
@@ -134,16 +134,10 @@ def save_tables(folder: Path) -> None:
     other = simulate_correspondences(rig, frames=8, matches=200, seed=1)
     for name, guess, given, of in (
         ("one", rig, table, "alignment"), ("mount", rig, other, "mount"),
-        ("lens", Rig(cameras=longer), table, "alignment"),
+        ("lens", longer, table, "alignment"),
         ("scatter", rig, replace(other, metadata={}), "alignment"),
     ):  # fmt: skip
         calibgraph.solve(guess, given, calibgraph.Config(of=of)).save(folder / name)
-
-
-def with_longer_lens(camera: Camera) -> Camera:
-    k = camera.intrinsics_px
-    return camera.model_copy(update={"intrinsics_px": k.model_copy(
-        update={"fx": 1.03 * k.fx, "fy": 1.03 * k.fy})})  # fmt: skip
 
 
 @pytest.fixture(autouse=True)

@@ -36,5 +36,10 @@ def put_lens_error(rig: Rig, part: LensPart, error: float) -> Rig:
 
 def with_known_lenses(rig: Rig) -> Rig:
     """The rig that states its lenses to be known exactly: the bar of a mount leaves them out."""
-    cameras = {name: camera.model_copy(update=_EXACT) for name, camera in rig.cameras.items()}
+    return with_fields(rig, **_EXACT)
+
+
+def with_fields(rig: Rig, **fields: object) -> Rig:
+    """The rig with these fields of every camera."""
+    cameras = {name: camera.model_copy(update=fields) for name, camera in rig.cameras.items()}
     return rig.model_copy(update={"cameras": cameras})

@@ -1,7 +1,5 @@
 """The graph is Eq. 5 of the paper, evaluated here literally."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The error model's values: stacked, and as GTSAM has them."""
 
-from __future__ import annotations
-
 import gtsam
 import numpy as np
 

@@ -1,7 +1,5 @@
 """What cameras see in common, in the solve: the relative pose, and what a wrong pose of A does."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import gtsam
@@ -25,6 +23,7 @@ from calibgraph.solver.pairs import MIN_PAIR_MATCHES, PairTerm, pair_graph, pair
 from calibgraph.solver.solution import Solution
 from calibgraph.solver.two_pass import optimize
 from factors import pose_sigmas
+from tests.conftest import points_in_front
 from tests.draws.lenses import with_known_lenses
 
 FRAMES = 8
@@ -37,13 +36,7 @@ def simulated_pairs(
     rng, parts = np.random.default_rng(seed), []
     a, b = list(rig.cameras.values())[:2]
     for frame in range(FRAMES):
-        points = np.exp(rng.uniform(np.log(4), np.log(40), (3 * count, 1))) * np.column_stack(
-            [
-                np.ones(3 * count),
-                rng.uniform(-0.7, 0.7, 3 * count),
-                rng.uniform(-0.2, 0.2, 3 * count),
-            ]
-        )
+        points = points_in_front(rng, 3 * count)
         normals = (
             rng.normal(0, 0.4, points.shape) + points / np.linalg.norm(points, axis=1)[:, None]
         )

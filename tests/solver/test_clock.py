@@ -1,7 +1,5 @@
 """Clocks that are estimated with the extrinsics: found, not overrated, and kept where unseen."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,7 +23,7 @@ from calibgraph.trust.evidence import Evidence
 from calibgraph.trust.lens_checks import intrinsics_checks
 from factors import Clock, displace
 from tests.draws.clocks import draw_twists, put_clock_error
-from tests.draws.lenses import put_lens_error
+from tests.draws.lenses import put_lens_error, with_fields
 from tests.solver.test_lens import FIVE_SIGMAS, simulated, squared_errors
 
 STRAIGHT = np.array([0.0, 0.0, 0.0, 10.0, 0.0, 0.0])
@@ -38,11 +36,6 @@ def late(
     rig, table = simulated(seed, frames=30, matches=100)
     twists = draw_twists(30, np.random.default_rng(seed)) if twists is None else twists
     return rig, put_clock_error(table, rig, twists, Clock(offset_s, readout_s))
-
-
-def with_times(rig: Rig, **times: float) -> Rig:
-    cameras = {name: camera.model_copy(update=times) for name, camera in rig.cameras.items()}
-    return rig.model_copy(update={"cameras": cameras})
 
 
 TURN, AHEAD, ASIDE = np.eye(6)[2:5] * [[0.1], [10.0], [10.0]]
@@ -102,7 +95,7 @@ def test_late_images_are_found(offset_s: float, readout_s: float, part: str) -> 
 def test_an_offset_beyond_what_the_rig_allows_is_no_pass(sigma_s: float, status: str) -> None:
     """50 ms late: 12.5, 20 and 100 prior sigmas, with limits at 13.5 and 56.1."""
     truth, table = late(0.05, 0.0)
-    rig = with_times(truth, time_offset_sigma_s=sigma_s)
+    rig = with_fields(truth, time_offset_sigma_s=sigma_s)
     result = solve(rig, table, Config(estimate="offset", common_deg=0.0))
     for name, verdict in result.camera_verdicts.items():
         (check,) = [one for one in verdict.checks if one.kind == "time_prior"]
@@ -121,7 +114,7 @@ def test_a_known_clock_is_as_good_as_none() -> None:
     """Points at the times of the pixels, and points of late images with the times in the rig."""
     truth, table = late(0.04, 0.02)
     _, same = late(0.0, 0.0)
-    known = with_times(truth, time_offset_s=0.04, readout_s=0.02)
+    known = with_fields(truth, time_offset_s=0.04, readout_s=0.02)
     expected, found = (solve_joint(rig, t) for rig, t in ((truth, same), (known, table)))
     for name, T in expected.T_camera_lidar.items():
         twist = twist_between(found.T_camera_lidar[name], T)
@@ -131,7 +124,7 @@ def test_a_known_clock_is_as_good_as_none() -> None:
 def test_a_stated_error_of_the_clock_is_one_of_the_pose() -> None:
     """10 ms at 10 m/s, which is 10 cm along the drive; at an unknown motion it is not."""
     truth, table = late(0.0, 0.0, twists=np.tile(STRAIGHT, (30, 1)))
-    doubted, truth = (with_times(truth, time_offset_sigma_s=each) for each in (0.01, 1e-6))
+    doubted, truth = (with_fields(truth, time_offset_sigma_s=each) for each in (0.01, 1e-6))
     still = replace(table, twist_per_s=None)
     for of, matches, added_m in (
         ("mount", table, 0.1), ("alignment", table, 0.1), ("alignment", still, 0.0)

@@ -1,7 +1,5 @@
 """Columns beside the pose: the scan distortion, what a twist does to pixels, the fit of some."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

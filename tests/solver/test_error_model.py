@@ -1,7 +1,5 @@
 """What errors are made of: what is stated, what is learnt, and the shares of an error bar."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Lenses that are estimated with the extrinsics: found, not overrated, and exact in the graph."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import gtsam
@@ -26,7 +24,7 @@ from calibgraph.simulation.rigs import rig_of
 from calibgraph.solver.joint import solve_joint
 from calibgraph.solver.lens import lens_estimates
 from calibgraph.solver.solution import Solution
-from tests.draws.lenses import put_lens_error, with_known_lenses
+from tests.draws.lenses import put_lens_error, with_fields, with_known_lenses
 from tests.solver.latent import all_values, reported_keys
 from tests.solver.test_places import STATED, minimize
 
@@ -60,12 +58,7 @@ def squared_errors(found: Solution, truth: Rig) -> list[float]:
 
 
 def known_to(rig: Rig, focal_px: float) -> Rig:
-    sigma = IntrinsicsSigma(focal=focal_px)
-    cameras = {
-        name: camera.model_copy(update={"intrinsics_sigma_px": sigma})
-        for name, camera in rig.cameras.items()
-    }
-    return rig.model_copy(update={"cameras": cameras})
+    return with_fields(rig, intrinsics_sigma_px=IntrinsicsSigma(focal=focal_px))
 
 
 @pytest.mark.parametrize(

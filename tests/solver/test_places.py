@@ -1,7 +1,5 @@
 """The error model: its estimate is the optimum and the marginal of the whole graph."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The filters keep the right rows; weights; the robust spread."""
 
-from __future__ import annotations
-
 from collections import Counter
 from pathlib import Path
 from typing import Any

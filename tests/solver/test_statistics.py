@@ -1,7 +1,5 @@
 """Many draws: the reported covariance is the scatter of the result. Marked, run apart."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Literal
 
@@ -16,9 +14,9 @@ from calibgraph.graph.lens import LensVariable
 from calibgraph.model.geometry import relative_covariance
 from calibgraph.model.lens import LensSigmas
 from calibgraph.solver.joint import solve_joint
-from tests.draws.lenses import put_lens_error, with_known_lenses
+from tests.draws.lenses import put_lens_error, with_fields, with_known_lenses
 from tests.draws.places import draw_places
-from tests.solver.test_clock import STRAIGHT, late, with_times
+from tests.solver.test_clock import STRAIGHT, late
 from tests.solver.test_lens import simulated, squared_errors
 
 pytestmark = pytest.mark.statistics
@@ -123,7 +121,7 @@ def of_stated_clock(seed: int) -> Drawn:
     sigma_s = 0.01
     offset_s = sigma_s * np.random.default_rng([seed, 1]).standard_normal()
     truth, table = late(offset_s, 0.0, seed, np.tile(STRAIGHT, (30, 1)))
-    return with_times(truth, time_offset_sigma_s=sigma_s), table, truth, Config()
+    return with_fields(truth, time_offset_sigma_s=sigma_s), table, truth, Config()
 
 
 def of_mount(seed: int) -> Drawn:

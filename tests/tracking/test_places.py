@@ -196,13 +196,13 @@ def whole_graph(tracker: IncrementalCalibrator) -> tuple[gtsam.NonlinearFactorGr
         gtsam.noiseModel.Gaussian.Information,
     )
     for place in range(len(rows)):
-        cloud, of_cloud = cloud_at_key(place), covariance(np.linalg.inv(terms.cloud[place]))
+        cloud, of_cloud = cloud_at_key(place), covariance(terms.cloud[place])
         graph.add(gtsam.BetweenFactorPose3(CLOUD, cloud, no_motion, of_cloud))
         at[cloud] = no_motion
         for camera in np.flatnonzero(terms.seen[place]).tolist():
             reference = to_T_lidar_camera(state.references[camera])
-            shown, own = reference.retract(terms.minimum[place, camera]), terms.root[place, camera]
-            key, known = matched_at_key(place, camera), own @ own.T / terms.least[camera]
+            shown = reference.retract(terms.minimum[place, camera])
+            key, known = matched_at_key(place, camera), terms.information[place, camera]
             apart = covariance(terms.at_place[place, camera])
             graph.add(gtsam.BetweenFactorPose3(matched_key(camera), key, no_motion, apart))
             graph.add(gtsam.BetweenFactorPose3(cloud, key, shown, information(known)))

@@ -9,7 +9,7 @@ import pytest
 from calibgraph import Config, Correspondences, MatcherErrors, Rig, simulate_correspondences
 from calibgraph.solver.matches import CameraBlock, camera_blocks
 from calibgraph.solver.preprocess import preprocess
-from calibgraph.tracking.eliminate import eliminate
+from calibgraph.tracking.estimate import Terms
 from calibgraph.tracking.state import STRENGTHS
 from calibgraph.tracking.sums import MOST_PLACES, PlaceSums, Sums
 
@@ -21,7 +21,7 @@ def part(name: str, seed: int, frames: int = 3) -> tuple[str, Sums]:
     rng = np.random.default_rng(seed)
     roots, scores = rng.standard_normal((2, 6, 6)), rng.standard_normal((frames, 2, 6))
     hessian = roots @ roots.swapaxes(1, 2)
-    return name, Sums.of(
+    return name, Sums.zeros(2).change(
         hessian=hessian,
         gradient=rng.standard_normal((2, 6)),
         reweighted=hessian,
@@ -35,15 +35,15 @@ def part(name: str, seed: int, frames: int = 3) -> tuple[str, Sums]:
 def sums_of(*parts: tuple[str, Sums]) -> PlaceSums:
     found = PlaceSums.empty(2)
     for name, one in parts:
-        found = found.add([name], Sums.stack([one]))
+        found = found.add([name], Sums(one.packed[None]))
     return found
 
 
 def test_frames_of_several_places_are_added_to_theirs_the_last_visited_last() -> None:
     frames = [part(name, seed) for seed, name in enumerate("abac")]
     names, sums = zip(*frames, strict=True)
-    found = PlaceSums.empty(2).add([names[0]], Sums.stack(sums[:1]))
-    found = found.add(names[1:], Sums.stack(sums[1:]))
+    found = PlaceSums.empty(2).add([names[0]], Sums(np.array([sums[0].packed])))
+    found = found.add(names[1:], Sums(np.array([one.packed for one in sums[1:]])))
     assert found.names[1:] == ("b", "a", "c")
     np.testing.assert_allclose(found.rows.packed[2], sums[0].packed + sums[2].packed)
 
@@ -86,7 +86,7 @@ def test_the_walk_adds_exactly_its_variance_to_the_covariance() -> None:
         scatter=C @ C.T,
         frames=np.array(10.0),
     )
-    walks = Sums.stack([epoch] * len(STRENGTHS))
+    walks = Sums(np.tile(epoch.packed, (len(STRENGTHS), 1)))
     variance = np.linspace(0.1, 0.6, 6)
     after = walks.after_walk(np.outer(STRENGTHS**2, variance), np.full(len(STRENGTHS), 3.0))
     for walk, strength in enumerate(STRENGTHS):
@@ -114,8 +114,18 @@ def test_places_are_eliminated_as_by_one_system_of_all_poses() -> None:
     minimum, adjoint = rng.standard_normal((P, n, 6)), rng.standard_normal((n, 6, 6))
     seen = np.ones((P, n), dtype=np.bool_)
     seen[1, 2] = False
-    weight = np.linalg.inv(np.linalg.inv(known) + at_place) * seen[..., None, None]
-    found = eliminate(weight, minimum, np.linalg.inv(cloud), adjoint)
+    terms = Terms(
+        names=tuple("abcd"),
+        known=np.full(P, -1),
+        seen=seen,
+        information=known * seen[..., None, None],
+        minimum=minimum,
+        at_place=at_place,
+        cloud=cloud,
+        robust_scale=np.inf,
+    )
+    chain = np.hstack([-adjoint.reshape(-1, 6), np.eye(6 * n)])
+    found = terms.eliminate(np.ones((P, 1 + n)), chain)
     size = 6 * (n + P + P * n)
     hessian, vector = np.zeros((size, size)), np.zeros(size)
 
@@ -136,19 +146,21 @@ def test_places_are_eliminated_as_by_one_system_of_all_poses() -> None:
                 add(parts, known[p, c], minimum[p, c])
     k = 6 * n
     gain = hessian[:k, k:] @ np.linalg.inv(hessian[k:, k:])
-    np.testing.assert_allclose(found.information, hessian[:k, :k] - gain @ hessian[k:, :k])
-    np.testing.assert_allclose(found.vector, vector[:k] - gain @ vector[k:])
+    shown = hessian[:k, :k] - gain @ hessian[k:, :k]
+    np.testing.assert_allclose(found.hessian, chain.T @ shown @ chain, atol=1e-11)
+    pull = vector[:k] - gain @ vector[k:]
+    np.testing.assert_allclose(found.gradient, -chain.T @ pull, atol=1e-11)
     for camera in range(n):  # with what all places share, the poses of places
         rows = slice(6 * camera, 6 * camera + 6)
         hessian[rows, rows] += shared[camera]
     optimum, covariance = np.linalg.solve(hessian, vector), np.linalg.inv(hessian)
-    u, v = found.displacements(optimum[:k].reshape(n, 6), at_place)
+    u, v = found.displacements(optimum[:k].reshape(n, 6))
     np.testing.assert_allclose(np.concatenate([u.ravel(), v.ravel()]), optimum[k:])
-    of_u, of_v = found.covariances(covariance[:k, :k], at_place)
-    blocks = np.concatenate([of_u, of_v.reshape(-1, 6, 6)])
-    for index, block in enumerate(blocks):
+    open_u, open_v = found.open_freedom(covariance[:k, :k])
+    blocks = [np.linalg.inv(own) for own in (*cloud, *at_place.reshape(-1, 6, 6))]
+    for index, expected in enumerate([*open_u, *open_v.ravel()]):
         rows = slice(k + 6 * index, k + 6 * index + 6)
-        np.testing.assert_allclose(block, covariance[rows, rows], atol=1e-12)
+        np.testing.assert_allclose(np.trace(blocks[index] @ covariance[rows, rows]), expected)
 
 
 ERRORS = MatcherErrors(noise_px=1.0, frame_noise_px=0.5, outlier_share=0.1)

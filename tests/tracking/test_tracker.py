@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import gtsam
 import numpy as np
@@ -18,6 +19,7 @@ from calibgraph import (
     IncrementalCalibrator,
     Rig,
     Update,
+    load_calibration,
     perturb,
     simulate_correspondences,
     solve,
@@ -75,7 +77,7 @@ def test_a_static_rig_gives_what_a_batch_gives(mixed_rig: Rig) -> None:
     assert not events_of(updates)
 
 
-def test_where_the_motion_is_known_the_clock_may_err_as_in_a_batch() -> None:
+def test_where_the_motion_is_known_the_clock_may_err_as_in_a_batch(tmp_path: Path) -> None:
     """5 ms at 10 m/s are 5 cm ahead, the third axis of a camera that looks there."""
     rig = with_known_lenses(rig_of("kitti"))
     still = simulate_correspondences(rig, frames=30, matches=100, errors=ERRORS, seed=1)
@@ -86,6 +88,8 @@ def test_where_the_motion_is_known_the_clock_may_err_as_in_a_batch() -> None:
         tracker, updates = tracked(rig, tables)
         batch, found = solve(rig, table).covariance, updates[-1].covariance
         ahead_cm.append([100 * np.sqrt(each["image_2"][5, 5]) for each in (found, batch)])
+        kept = load_calibration(tracker.calibration().save(tmp_path))
+        assert ("time offset" in kept.not_included) == (table is still)
     (alone, _), (whole, in_batch) = ahead_cm
     assert whole == pytest.approx(np.hypot(alone, 5.0), rel=0.1)
     assert whole == pytest.approx(in_batch, rel=0.1)

@@ -6,8 +6,6 @@ from pathlib import Path
 
 import gtsam
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from calibgraph import (
     IncrementalCalibrator,
@@ -85,6 +83,9 @@ EVENTS = {"moved": "#D55E00", "drifts": "#A0408A", "blind": "#555555", "back": "
 
 def draw_updates(updates: Sequence[Update], path: Path) -> None:
     """Each camera's extrinsics against time, less the newest, with 3-sigma bands and events."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
     events = [event for update in updates for event in update.events if event.kind in EVENTS]
     figure = Figure(figsize=(16, 1.5 + 2.5 * len(NAMES)), layout="constrained")
     FigureCanvasAgg(figure)

@@ -1,0 +1,298 @@
+"""Cameras and several LiDARs: clouds joined for cameras, and LiDARs that only cameras join.
+
+Where the base alone shows cameras too little, these are matched with the clouds of all LiDARs.
+
+Clouds are joined in the base, by the poses found. A point of another LiDAR errs by that pose: with
+H the Hessian of a camera's matches, H_l that of those with points of LiDAR l, and eta the error of
+its pose, p_base = exp(eta) T_base_lidar p_lidar, a camera errs by xi = - H^-1 H_l Ad(T) eta, with
+T_camera_lidar = exp(xi) estimate. So cameras and LiDARs have one covariance.
+
+LiDARs that share nothing may show the same cameras. Each camera i is then calibrated to both, and
+T_base_lidar = T_i_base^-1 T_i_lidar with the error Ad(T_i_base^-1) (xi_i_lidar - xi_i_base): the
+estimate is the mean over cameras, weighted by the covariance of these.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag
+from scipy.spatial import cKDTree
+
+from calibgraph.arrays import Array
+from calibgraph.errors import CalibrationError
+from calibgraph.io.dataset import Dataset, spread_out
+from calibgraph.io.frame import Frame
+from calibgraph.matching.protocol import FullMatcher
+from calibgraph.model.calibration import Calibration
+from calibgraph.model.config import Config, LensPart
+from calibgraph.model.correspondences import Correspondences
+from calibgraph.model.geometry import (
+    adjoints,
+    invert,
+    pose_rows,
+    retract_all,
+    transform,
+    twist_between,
+)
+from calibgraph.model.rig import Camera, Rig
+from calibgraph.progress import Progress
+from calibgraph.solver.matches import camera_block
+from calibgraph.solver.within_place import WEAK
+from calibgraph.vehicle.lidars import LidarPoses
+
+Cloud = NDArray[np.float32]
+
+_LEAST_SEEN = 0.7
+"""Share of the cells that all LiDARs show a camera, which the base shows: with less, clouds are
+joined. Of two roof LiDARs with 64 beams, which need not be, it is 0.9."""
+_CELLS, _LEAST_CELLS = (24, 15), 36  # of an image; of these, so that a camera can be calibrated
+_FRAMES = 3  # that are looked at
+_SURE = 2.0  # standard deviations of a pose that the tolerance allows
+
+
+def join_clouds(
+    data: Dataset, rig: Rig, poses: LidarPoses, tolerance: tuple[float, float]
+) -> tuple[Dataset, str]:
+    """The dataset with the clouds of LiDARs that are well known joined; why, empty if they are not.
+
+    Args:
+        data: its frames have the clouds of all LiDARs, or of some.
+        rig: with the guess of the cameras.
+        poses: of the LiDARs.
+        tolerance: [deg, cm] of the verdict: of a LiDAR, two standard deviations are within.
+    """
+    most = np.array([np.radians(tolerance[0]), tolerance[1] / 100.0]) / _SURE
+    joined = {
+        name: poses.T_base_lidar[name]
+        for name, covariance in poses.covariance.items()
+        if (np.sqrt(np.diag(covariance)).reshape(2, 3).max(axis=1) <= most).all()
+    }
+    frames = tuple(
+        replace(f, joined={n: T for n, T in joined.items() if n in f.lidar_paths}, kept=None)
+        for f in data.frames
+    )
+    if not any(frame.joined for frame in frames):
+        return data, ""
+    shares = _shares_of_base(spread_out(frames, _FRAMES), rig)
+    poor = {name: share for name, share in shares.items() if share < _LEAST_SEEN}
+    if not poor:
+        return data, ""
+    seen = ", ".join(f"{name} {share:.0%}" for name, share in poor.items())
+    line = f"clouds of {rig.lidar}, {', '.join(joined)} are joined for cameras, since {rig.lidar} "
+    line += f"alone shows of what all show: {seen}"
+    return replace(data, frames=frames, recorded=()), line
+
+
+def place_by_cameras(
+    calibrate: Callable[[Dataset, Rig], Calibration], data: Dataset, rig: Rig, name: str
+) -> LidarPoses:
+    """The pose of a LiDAR by cameras that see what it sees, and what the base sees.
+
+    Args:
+        calibrate: cameras to the one cloud of each frame, from where a rig has them.
+        data: with the clouds of both.
+        rig: with the guess of cameras, and of the LiDAR.
+        name: of the LiDAR.
+
+    Raises:
+        CalibrationError: if no camera has been found in the clouds of both.
+    """
+    T_guess, alone = (
+        rig.T_base_lidar[name],
+        rig.model_copy(update={"lidars": None, "vehicle": None}),
+    )
+    own = replace(data, frames=tuple(_of_lidar(f, name, T_guess) for f in data.frames), recorded=())
+    at_other = alone.moved_to({n: T @ T_guess for n, T in alone.T_camera_lidar.items()})
+    sides = [(replace(data, frames=tuple(replace(f, lidar_paths={}) for f in data.frames)), alone)]
+    sides += [(own, at_other)]
+    both = [_cameras_in(side, of) for side, of in sides]
+    seen = [camera for camera in rig.cameras if all(camera in of for of in both)]
+    if not seen:
+        raise CalibrationError(f"no camera sees what {rig.lidar} and {name} see")
+    base, other = (calibrate(side, _with_cameras(of, seen)) for side, of in sides)
+    found = [n for n in seen if "FAIL" not in (base.verdicts[n].status, other.verdicts[n].status)]
+    if not found or base.joint_covariance is None or other.joint_covariance is None:
+        raise CalibrationError(
+            f"{rig.lidar} and {name} share no planes, and of the cameras that see what both see "
+            f"({', '.join(seen)}) none is calibrated to both"
+        )
+    T = [invert(base.rig.T_camera_lidar[n]) @ other.rig.T_camera_lidar[n] for n in found]
+    rows = np.concatenate([np.r_[pose_rows(seen.index(n))] for n in found])
+    to_base = block_diag(*adjoints(invert(np.array([base.rig.T_camera_lidar[n] for n in found]))))
+    covariance = (base.joint_covariance + other.joint_covariance)[np.ix_(rows, rows)]
+    weight = np.linalg.inv(to_base @ covariance @ to_base.T)
+    mean, apart = (
+        np.tile(np.eye(6), (len(found), 1)),
+        np.concatenate([twist_between(each, T[0]) for each in T]),
+    )
+    own_covariance = np.linalg.inv(mean.T @ weight @ mean)
+    step = own_covariance @ mean.T @ weight @ apart
+    left = apart - mean @ step
+    ratio = max(1.0, float(left @ weight @ left) / max(6 * (len(found) - 1), 1))
+    T_base_lidar = retract_all(T[0][None], -step[None])[0]
+    turn = np.linalg.inv(_turn_at(T_base_lidar))
+    return LidarPoses(
+        rig.lidar,
+        {rig.lidar: np.eye(4), name: T_base_lidar},
+        turn @ own_covariance @ turn.T * ratio,
+        {},
+        len(data.frames),
+        (ratio, ratio),
+    )
+
+
+def _of_lidar(frame: Frame, name: str, T_base_lidar: Array) -> Frame:
+    """The frame with the cloud of another LiDAR, which moves as the base does."""
+    turn, motion = adjoints(invert(T_base_lidar)[None])[0], frame.motion
+    own = replace(
+        frame, cloud_path=frame.lidar_paths[name], lidar_paths={}, columns=None, find_motion=None,
+        find_twist=None, kept=None,
+    )  # fmt: skip
+    if motion is None:
+        return own
+    twist = tuple((turn @ motion.twist_per_s).tolist())
+    moved = replace(motion, twist_per_s=twist, T_world_lidar=None)
+    return replace(own, find_motion=lambda: moved)
+
+
+def _with_cameras(rig: Rig, names: Sequence[str]) -> Rig:
+    """The rig with some of its cameras."""
+    kept = [pair for pair in rig.relative_poses if {pair.a, pair.b} <= {*names}]
+    cameras = {name: rig.cameras[name] for name in names}
+    return rig.model_copy(update={"cameras": cameras, "relative_poses": tuple(kept)})
+
+
+def _cameras_in(data: Dataset, rig: Rig) -> list[str]:
+    """The cameras whose images have enough points."""
+    clouds = [frame.load_cloud() for frame in spread_out(data.frames, _FRAMES)]
+    least = _LEAST_CELLS * len(clouds)
+    return [n for n, c in rig.cameras.items() if sum(_cells(c, cloud) for cloud in clouds) >= least]
+
+
+def _shares_of_base(frames: Sequence[Frame], rig: Rig) -> dict[str, float]:
+    """Per camera, the cells of its images with points of the base, over those with any."""
+    clouds = [(replace(each, joined={}).load_cloud(), each.load_cloud()) for each in frames]
+    found = {}
+    for name, camera in rig.cameras.items():
+        base, every = (
+            sum(_cells(camera, cloud) for cloud in of) for of in zip(*clouds, strict=True)
+        )
+        found[name] = base / every if every else 1.0
+    return found
+
+
+def _cells(camera: Camera, cloud: Cloud) -> int:
+    """How many cells of the image have points."""
+    pixels, seen = camera.lens.project(cloud[:, :3].astype(np.float64), camera.T_camera_lidar)
+    size = np.array([camera.width_px, camera.height_px])
+    cells = np.floor((pixels[seen] + 0.5) / size * _CELLS).astype(np.int64)
+    inside = ((cells >= 0) & (cells < _CELLS)).all(axis=1)
+    return len(np.unique(cells[inside], axis=0))
+
+
+class JoinedMatcher:
+    """A matcher on joined clouds: its tables have the errors of cameras by those of LiDARs."""
+
+    def __init__(self, matcher: FullMatcher, poses: LidarPoses) -> None:
+        self._matcher, self._poses = matcher, poses
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._matcher, name)
+
+    def with_estimate(self, parts: Sequence[LensPart]) -> JoinedMatcher:
+        """The matcher for solves that estimate these parts of lens and clock."""
+        return JoinedMatcher(self._matcher.with_estimate(parts), self._poses)
+
+    def match(
+        self, dataset: Dataset, rig: Rig, *, round_index: int, progress: Progress
+    ) -> Correspondences:
+        """The correspondences, with what LiDARs add to the error bars in their findings."""
+        table = self._matcher.match(dataset, rig, round_index=round_index, progress=progress)
+        errors = errors_by_lidars(table, dataset.frames, rig, self._poses)
+        content = {name: columns.tolist() for name, columns in errors.items()}
+        return table.with_findings(replace(table.findings, by_lidars=content))
+
+
+def errors_by_lidars(
+    table: Correspondences, frames: Sequence[Frame], rig: Rig, poses: LidarPoses
+) -> dict[str, Array]:
+    """Per camera, (6, 6 k) xi by a standard deviation of each of the errors of k LiDARs.
+
+    Args:
+        table: with points of joined clouds.
+        frames: that they are from.
+        rig: where the cameras are.
+        poses: of the LiDARs.
+    """
+    names, found = [*poses.covariance], {}
+    turns = block_diag(*(_turn_at(poses.T_base_lidar[name]) for name in names))
+    twists, sources = turns @ _root(poses), _sources(table, frames, names)
+    for number, name in enumerate(table.cameras):
+        rows = np.flatnonzero(table.camera_index == number)
+        if len(rows) == 0:
+            continue
+        order = rows[np.argsort(table.frame[rows], kind="stable")]
+        camera, own = rig.cameras[name], sources[order]
+        block = camera_block(camera, table.select(order), Config()).block
+        T = camera.T_camera_lidar[None]
+        hessian = block.summarize(T).hessian[0] + WEAK
+        parts = [
+            block.select(own == k).summarize(T).hessian[0] if (own == k).any() else np.zeros((6, 6))
+            for k in range(len(names))
+        ]
+        by_poses = np.linalg.solve(hessian, np.hstack([part @ adjoints(T)[0] for part in parts]))
+        found[name] = -by_poses @ twists
+    return found
+
+
+def _turn_at(T_base_lidar: Array) -> Array:
+    """(6, 6) from a rotation omega and a shift of the position t to (omega, shift + t x omega)."""
+    shifted = transform(np.eye(3), T_base_lidar[:3, 3])
+    return np.asarray(adjoints(shifted[None])[0])
+
+
+def _root(poses: LidarPoses) -> Array:
+    """(6 k, 6 k) Cholesky root of the covariance of all rotations and positions."""
+    exact = 1e-18 * np.eye(len(poses.joint_covariance))  # for rounding
+    return np.asarray(np.linalg.cholesky(poses.joint_covariance + exact))
+
+
+def _sources(table: Correspondences, frames: Sequence[Frame], names: Sequence[str]) -> Array:
+    """(n,) the number of the LiDAR whose point is nearest to each match's, -1 of the base."""
+    found = np.full(len(table), -1)
+    for frame in frames:
+        rows = np.flatnonzero(table.frame == frame.index)
+        if not len(rows):
+            continue
+        points = table.points_lidar_m[rows]
+        nearest = _distances(replace(frame, joined={}, kept=None).load_cloud(), points)
+        for number, name in enumerate(names):
+            cloud = frame.load_in_base(name) if name in frame.joined else None
+            if cloud is not None:
+                away = _distances(cloud, points)
+                found[rows[away < nearest]] = number
+                nearest = np.minimum(nearest, away)
+    return found
+
+
+def _distances(cloud: Cloud, points: Array) -> Array:
+    return np.asarray(cKDTree(cloud[:, :3]).query(points)[0])
+
+
+def joint_covariance(cameras: Array, by_lidars: Array, poses: LidarPoses) -> Array:
+    """(6 N + 6 k) of cameras and LiDARs, with rotations and positions of these, in the base.
+
+    Args:
+        cameras: (6 N, 6 N) with the part by the poses of LiDARs.
+        by_lidars: (6 N, 6 k) by :func:`errors_by_lidars`, or (6 N, 0).
+        poses: of the LiDARs.
+    """
+    across = np.zeros((len(cameras), len(poses.joint_covariance)))
+    if by_lidars.size:
+        across = by_lidars @ _root(poses).T
+    return np.block([[cameras, across], [across.T, poses.joint_covariance]])
