@@ -24,8 +24,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from factors import kernel
-from factors.arrays import contiguous, read_only
-from factors.lens import Lens, LensModel
+from factors.arrays import read_only
+from factors.lens import Lens
 from factors.lens_kernels import FISHEYE, OMNIDIRECTIONAL, PINHOLE
 from factors.pose_kernel import exponential_times
 
@@ -47,11 +47,6 @@ _NUMBERS = {name: number for number, name in enumerate(LENS)} | {
     "p1": kernel.P1,
     "p2": kernel.P2,
     **{f"k{power}": kernel.P2 + power for power in range(1, 5)},
-}
-_MODELS: Mapping[int, tuple[LensModel, int]] = {
-    PINHOLE: ("pinhole", 8),
-    FISHEYE: ("fisheye", 4),
-    OMNIDIRECTIONAL: ("omnidirectional", 5),
 }
 
 
@@ -85,9 +80,9 @@ def displace(points_m: Array, twists_per_s: Array, seconds: ArrayLike) -> Array:
     """
     steps = np.empty((len(points_m), 6))
     steps[:] = np.reshape(seconds, (-1, 1)) * twists_per_s
-    T, moved = np.tile(np.eye(4), (len(steps), 1, 1)), np.empty((len(steps), 4, 4))
-    exponential_times(contiguous(steps), contiguous(T), moved)
-    return np.asarray(np.einsum("nij,nj->ni", moved[:, :3, :3], points_m) + moved[:, :3, 3])
+    T = np.tile(np.eye(4), (len(steps), 1, 1))
+    exponential_times(steps, T)
+    return np.asarray(np.einsum("nij,nj->ni", T[:, :3, :3], points_m) + T[:, :3, 3])
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,9 +160,7 @@ class Columns:
         packed[2:4] += steps.get(CENTRE_X, 0.0), steps.get(CENTRE_Y, 0.0)
         for name, number in COEFFICIENT_NUMBERS[self.lens.kind].items():
             packed[4 + number] += steps.get(name, 0.0)
-        model, size = _MODELS[self.lens.kind]
-        named = dict(zip(("fx", "fy", "cx", "cy"), packed.tolist(), strict=False))
-        return Lens.of(model, **named, distortion=packed[4 : 4 + size].tolist())
+        return Lens.limited(self.lens.kind, packed)
 
     def clock_at(self, values: Array) -> Clock:
         """The clock of (k,) values."""
@@ -181,7 +174,3 @@ class Columns:
     def _steps(self, values: Array) -> dict[str, float]:
         """By name, the differences from the mean of the prior."""
         return dict(zip(self.parameters, np.multiply(values, self.sigmas).tolist(), strict=True))
-
-    def coefficient(self, name: str, values: Array) -> float:
-        """A distortion coefficient of the lens of (k,) values."""
-        return float(self.at(values).packed[4 + COEFFICIENT_NUMBERS[self.lens.kind][name]])

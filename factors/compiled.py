@@ -89,17 +89,12 @@ def _name(function: Callable[..., Any], options: Mapping[str, Any]) -> str:
     return "_".join(filter(None, (function.__qualname__, digest)))
 
 
-def has_kernels(source: str) -> bool:
-    """Whether a file defines kernels, by its text."""
-    return re.search(r"^\s*@compiled\b", source, re.MULTILINE) is not None
-
-
 @cache
 def _files(module: str) -> tuple[Path, ...]:
     """The file of a module, and the files with kernels that it imports, and that these do."""
     name = getattr(sys.modules.get(module), "__file__", None)
     source = Path(name).read_text("utf-8") if name else ""
-    if not has_kernels(source):
+    if not re.search(r"^\s*@compiled\b", source, re.MULTILINE):
         return ()
     others = re.findall(r"^from (\S+) import", source, re.MULTILINE)
     return tuple(sorted({Path(str(name)), *chain.from_iterable(map(_files, others))}))

@@ -19,14 +19,14 @@ def unit_diagonal(hessian: Array) -> tuple[Array, Array]:
     """Scale a positive semidefinite matrix to a unit diagonal; rows without information stay zero.
 
     Args:
-        hessian: (n, n).
+        hessian: (..., n, n).
 
     Returns:
-        (n, n) scaled = hessian / (units units^T), and (n,) units.
+        (..., n, n) scaled = hessian / (units units^T), and (..., n) units.
     """
-    diagonal = np.sqrt(np.maximum(np.diag(hessian), 0.0))
+    diagonal = np.sqrt(np.maximum(np.diagonal(hessian, axis1=-2, axis2=-1), 0.0))
     units = np.where(diagonal > 0, diagonal, 1.0)
-    return hessian / np.outer(units, units), units
+    return hessian / (units[..., :, None] * units[..., None, :]), units
 
 
 def smallest_scaled_eigenvalues(hessians: Array) -> Array:
@@ -35,11 +35,9 @@ def smallest_scaled_eigenvalues(hessians: Array) -> Array:
     1 if no unknowns are correlated, 0 if one is free. Rounding noise of a singular one is near
     1e-15.
     """
-    diagonals = np.einsum("fii->fi", hessians)
-    known = (diagonals > 0).all(axis=1)
-    units = np.sqrt(np.where(known[:, None], diagonals, 1.0))
-    values = np.linalg.eigvalsh(hessians / (units[:, :, None] * units[:, None, :]))
-    return np.where(known, values[:, 0], 0.0)
+    scaled, _ = unit_diagonal(hessians)
+    known = (np.diagonal(scaled, axis1=1, axis2=2) > 0).all(axis=1)
+    return np.where(known, np.linalg.eigvalsh(scaled)[:, 0], 0.0)
 
 
 def invert_or_none(hessian: Array, *, least: float = SINGULAR) -> Array | None:

@@ -81,10 +81,22 @@ class Lens:
         Raises:
             ValueError: on another number of coefficients, or a focal length that is not positive.
         """
-        coefficients = _checked(fx, fy, distortion, model)
-        kind, limit_of = _KINDS[model]
-        packed = [fx, fy, cx, cy, *coefficients, limit_of(tuple(coefficients.tolist()))]
-        return Lens(kind, np.array(packed, dtype=np.float64))
+        if not (fx > 0 and fy > 0):
+            raise ValueError(f"focal lengths must be positive, found fx={fx}, fy={fy}")
+        if len(distortion) not in COEFFICIENTS[model]:
+            allowed = ", ".join(map(str, COEFFICIENTS[model]))
+            raise ValueError(
+                f"{len(distortion)} distortion coefficients found, "
+                f"expected {allowed}: {ORDERS[model]}"
+            )
+        none = [0.0] * (8 - len(distortion))
+        return Lens.limited(_KINDS[model], np.array([fx, fy, cx, cy, *distortion, *none], float))
+
+    @staticmethod
+    def limited(kind: int, parameters: Array) -> Lens:
+        """A lens of (12,) packed parameters; the limit of its domain follows from these."""
+        limit = _LIMITS[kind](tuple(parameters[4:12].tolist()))
+        return Lens(kind, np.append(parameters[:12], limit))
 
     @property
     def pixels_per_rad(self) -> float:
@@ -125,17 +137,6 @@ def _columns(points_m: ArrayLike) -> Array:
     columns = np.zeros((5, len(points)))
     columns[:3] = points.T
     return contiguous(columns)
-
-
-def _checked(fx: float, fy: float, distortion: Sequence[float], model: LensModel) -> Array:
-    if not (fx > 0 and fy > 0):
-        raise ValueError(f"focal lengths must be positive, found fx={fx}, fy={fy}")
-    if len(distortion) not in COEFFICIENTS[model]:
-        allowed = ", ".join(map(str, COEFFICIENTS[model]))
-        raise ValueError(
-            f"{len(distortion)} distortion coefficients found, expected {allowed}: {ORDERS[model]}"
-        )
-    return np.pad(np.asarray(distortion, dtype=np.float64), (0, 8 - len(distortion)))
 
 
 def _smallest_positive_root(polynomial: NDArray[Any]) -> float:
@@ -197,12 +198,16 @@ def _omnidirectional_limit(coefficients: tuple[float, ...]) -> float:
     return math.atan(radius) + math.asin(sine)
 
 
-_KINDS: dict[LensModel, tuple[int, Callable[[tuple[float, ...]], float]]] = {
-    "pinhole": (PINHOLE, _radtan_limit),
-    "fisheye": (FISHEYE, _fisheye_limit),
-    "omnidirectional": (OMNIDIRECTIONAL, _omnidirectional_limit),
+_KINDS: dict[LensModel, int] = {
+    "pinhole": PINHOLE,
+    "fisheye": FISHEYE,
+    "omnidirectional": OMNIDIRECTIONAL,
 }
-"""The kind of each model, and the limit of its domain by its coefficients."""
+_LIMITS: dict[int, Callable[[tuple[float, ...]], float]] = {
+    PINHOLE: _radtan_limit,
+    FISHEYE: _fisheye_limit,
+    OMNIDIRECTIONAL: _omnidirectional_limit,
+}
 
 
 def unproject(lens: Lens, pixels_px: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:

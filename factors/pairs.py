@@ -209,16 +209,19 @@ def _kernel(kind: int) -> Any:
     @compiled(fastmath=FAST)
     def sum_runs(lens, T_a, T_b, features, scale, sigma, edges, sums, residuals, visible):  # type: ignore[no-untyped-def]
         """Fill in zeros (r, 1, 14, 13), see ``kernel``; or residuals, where there is room."""
-        tile, psi = np.empty((13, WIDTH)), np.empty(TILE)
+        tile, psi = np.zeros((13, WIDTH)), np.empty(TILE)  # zero: a second, epipolar residual
         for run in range(len(sums)):
             T, found = T_a[run if len(T_a) > 1 else 0], sums[run, 0]
             M = _relative_pose(T, T_b[run if len(T_b) > 1 else 0])
             for start in range(edges[run], edges[run + 1], TILE):
                 n = min(TILE, edges[run + 1] - start)
+                for k in range(13 if kind == EPIPOLAR else 0):
+                    for i in range(n, min(2 * n, TILE)):
+                        tile[k, i] = 0.0
                 for i in range(n):
                     seen = True
                     if kind == EPIPOLAR:
-                        _fill_epipolar(M, features[start + i], tile, i, n)
+                        _fill_epipolar(M, features[start + i], tile, i)
                     else:
                         seen = _fill_surface(kind, lens, T, M, features[start + i], tile, i, n)
                     if len(residuals):
@@ -266,8 +269,8 @@ def _fill_surface(kind, lens, T_a, M, feature, tile, i, n):  # type: ignore[no-u
 
 
 @compiled(part=True)
-def _fill_epipolar(M, feature, tile, at, n):  # type: ignore[no-untyped-def]
-    """Fill in derivatives by A and B, and the residual; those of a second one are zero."""
+def _fill_epipolar(M, feature, tile, at):  # type: ignore[no-untyped-def]
+    """Fill in derivatives by A and B, and the residual."""
     value, half, square = np.empty(7), np.zeros(6), 0.0
     for x, y in ((3, 9), (6, 9), (0, 12), (0, 15)):
         _fill_form(M, feature[x : x + 3], feature[y : y + 3], value)
@@ -287,8 +290,6 @@ def _fill_epipolar(M, feature, tile, at, n):  # type: ignore[no-untyped-def]
     for k in range(3):
         tile[k, at] = -(w0 * M[0, k] + w1 * M[1, k] + w2 * M[2, k])
         tile[3 + k, at] = -(v0 * M[0, k] + v1 * M[1, k] + v2 * M[2, k])
-    for k in range(13):
-        tile[k, n + at] = 0.0
 
 
 @compiled(part=True)

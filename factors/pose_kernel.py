@@ -22,15 +22,15 @@ _SMALL_STEP = 1e-10  # rad, m: below what residuals of 1e-6 px resolve
 
 
 @compiled()
-def exponential_times(twists, T, out):  # type: ignore[no-untyped-def]
-    """Fill (f, 4, 4) ``out`` with exp(twist) T of (f, 6) twists and (f, 4, 4) transforms."""
+def exponential_times(twists, T):  # type: ignore[no-untyped-def]
+    """Multiply (f, 4, 4) transforms, in place, by exp(twist) from the left, of (f, 6) twists."""
     for i in range(len(twists)):
-        move(1.0, twists[i], T[i], out[i])
+        move(1.0, twists[i], T[i], T[i])
 
 
 @compiled(part=True)
 def move(sign, twist, T, out):  # type: ignore[no-untyped-def]
-    """Fill in ``out`` with exp(sign twist) T."""
+    """Fill in ``out`` with exp(sign twist) T; it may be T itself."""
     x, y, z = sign * twist[0], sign * twist[1], sign * twist[2]
     u, v, w = sign * twist[3], sign * twist[4], sign * twist[5]
     angle = math.sqrt(x * x + y * y + z * z)

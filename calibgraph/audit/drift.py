@@ -210,10 +210,6 @@ def _freedom(result: Calibration, name: str) -> float:
     return freedom_of_places(int(values["lidar_instants"] or 1), len(result.lidar_verdicts))
 
 
-def _axes(result: Calibration, name: str) -> tuple[str, ...]:
-    return CAMERA_AXES if name in result.rig.cameras else LIDAR_AXES
-
-
 def _judge(
     results: Mapping[str, Calibration], camera: str, found: Deviations | None, limits: LimitsOf
 ) -> tuple[CameraAudit, ...]:
@@ -225,11 +221,12 @@ def _judge(
         return tuple(judged)
     of_one = results[names[0]]
     alone = SINGLE_CAMERA if of_one.rig.cameras else SINGLE_LIDAR
+    axes_of = CAMERA_AXES if camera in of_one.rig.cameras else LIDAR_AXES
     alone = "" if len(of_one.joint_names) > 1 else alone
     for row, place in enumerate(found.poses.results):
         deviation, covariance = found.deviation[row], found.covariance[row]
         own, sigma = limits(found.freedom[row]), np.sqrt(np.diag(covariance))
-        status, reason = judge_deviation(deviation, covariance, own, axes=_axes(of_one, camera))
+        status, reason = judge_deviation(deviation, covariance, own, axes=axes_of)
         axes: tuple[int, ...] = ()
         if status == "WRONG":
             status = "CHANGED"

@@ -15,7 +15,6 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from calibgraph.arrays import Array
-from factors.arrays import contiguous
 from factors.pose_kernel import exponential_times, logarithms
 
 
@@ -186,8 +185,8 @@ def retract_all(T_camera_lidar: Array, steps: Array) -> Array:
         T_camera_lidar: (f, 4, 4).
         steps: (f, 6) tangents of T_lidar_camera: rotation [rad], translation [m].
     """
-    moved = np.empty((len(steps), 4, 4))
-    exponential_times(contiguous(-steps), contiguous(T_camera_lidar), moved)
+    moved = np.array(T_camera_lidar, order="C")
+    exponential_times(np.ascontiguousarray(-steps), moved)
     return moved
 
 

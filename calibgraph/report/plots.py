@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 # BGR colours that the colour-blind can tell apart (Okabe and Ito, "Color universal design").
 _MATCH, _ARROW, _FRAME = (178, 114, 0), (0, 94, 213), (160, 160, 160)
 
-_MAX_DOTS = 6000
+_MAX_DOTS = 6000  # evenly spread; more would overlap
 _DOT_SHARE = 0.35  # of the colour of a dot, the rest is white; several dots add up
 _WIDTH_PX = 800
 _SUBPIXEL_BITS = 4
@@ -39,7 +39,8 @@ def residual_map(camera: Camera, errors: ReprojectionErrors) -> tuple[str, float
     """
     inliers, scale = errors.select(errors.is_inlier), _WIDTH_PX / camera.width_px
     height = max(1, round(scale * camera.height_px))
-    dots = _thin(inliers.pixels_px)
+    shown = np.linspace(0, len(inliers.pixels_px) - 1, min(len(inliers.pixels_px), _MAX_DOTS))
+    dots = inliers.pixels_px[shown.round().astype(int)]
     column, row = np.clip(scale * (dots + 0.5), 0, np.array([_WIDTH_PX, height]) - 1).astype(int).T
     count = np.zeros((height, _WIDTH_PX), np.float32)
     np.add.at(count, (row, column), 1)
@@ -59,12 +60,6 @@ def png_uri(image: NDArray[np.uint8]) -> str:
     """A picture, BGR, as a PNG in a data URI."""
     _, data = cv2.imencode(".png", image)
     return f"data:image/png;base64,{base64.b64encode(data.tobytes()).decode('ascii')}"
-
-
-def _thin(dots: Array) -> Array:
-    """At most _MAX_DOTS of the rows, evenly spread; more would overlap."""
-    rows = np.linspace(0, len(dots) - 1, min(len(dots), _MAX_DOTS)).round().astype(int)
-    return np.asarray(dots[rows])
 
 
 def arrow_factor(means: Array, cell_px: float) -> float:

@@ -29,7 +29,7 @@ from calibgraph.solver.covariance import FittedObjective, positive_part
 from calibgraph.solver.places import ErrorFit
 from calibgraph.solver.within_place import WEAK, WithinPlace
 from factors import Columns, ProjectionBlock, to_runs
-from factors.columns import CENTRE_X, CENTRE_Y, FOCAL, OFFSET, READOUT
+from factors.columns import CENTRE_X, CENTRE_Y, COEFFICIENT_NUMBERS, FOCAL, OFFSET, READOUT
 
 Lenses = Mapping[str, LensVariable]
 
@@ -307,5 +307,6 @@ def _in_units(lens: LensVariable, values: Array) -> Array:
         CENTRE_X: k.cx,
         CENTRE_Y: k.cy,
     }
-    names = lens.free.parameters
-    return np.array([known[n] if n in known else lens.free.coefficient(n, values) for n in names])
+    numbers, packed = COEFFICIENT_NUMBERS[lens.free.lens.kind], lens.free.at(values).packed
+    known |= {name: packed[4 + number] for name, number in numbers.items()}
+    return np.array([known[name] for name in lens.free.parameters])

@@ -348,24 +348,23 @@ class Linearization:
 
 
 def soften(
-    hessian: Array, gradient: Array, covariance: Array, error: Array
+    hessian: Array, gradient: Array, covariance: Array, error: Array | None = None
 ) -> tuple[Array, Array, Displacement]:
     """A quadratic whose pose has been set free about a tie, in the step of c + e.
 
-    Of (..., k, k) and (..., k), the pose in front, S and e.
+    Of (..., k, k) and (..., k), the pose in front, S and e, which is zero if it is None.
     """
-    rows = hessian[..., :6, :]
+    pulled = gradient if error is None else gradient - _times(hessian[..., :6], error)
+    whole = np.concatenate([hessian, pulled[..., None]], axis=-1)
+    rows = whole[..., :6, :]
     left = _inverses(np.eye(6) + rows[..., :6] @ covariance)
     free = covariance @ left
     free = (free + _turned(free)) / 2
-    pull = gradient[..., :6] - _times(rows[..., :6], error)
-    across = _turned(rows)
-    softened = hessian - across @ (free @ rows)
+    softened = whole - _turned(hessian[..., :6, :]) @ (free @ rows)
     softened[..., :6, :] = left @ rows
-    softened[..., :6] = _turned(softened[..., :6, :])
-    pulled = gradient - _times(across, error + _times(free, pull))
-    pulled[..., :6] = _times(left, pull)
-    return softened, pulled, Displacement(rows, pull, np.zeros_like(free), left, free)
+    softened[..., :6] = _turned(softened[..., :6, :-1])
+    own = Displacement(rows[..., :-1], rows[..., -1], np.zeros_like(free), left, free)
+    return softened[..., :-1], softened[..., -1], own
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,6 +12,7 @@ from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences, rows_where
 from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.rig import Rig
+from factors.arrays import contiguous
 from factors.compiled import compiled
 
 FILTERS = ("given", "projectable", "confident", "best_in_cell", "capped")
@@ -236,7 +237,8 @@ def _best_of_runs(
 ) -> NDArray[np.bool_]:
     """(n,) which rows have the largest confidence, the first of them, of their run and cell."""
     keep = np.zeros(len(cell), dtype=np.bool_)
-    _keep_best(edges, np.full(cells, -1), cell, confidence, among, keep)
+    given = (contiguous(array) for array in (cell, confidence, among))
+    _keep_best(edges, np.full(cells, -1), *given, keep)
     return keep
 
 

@@ -28,6 +28,7 @@ from calibgraph.tracking.sums import Sums
 from factors import BlockSums, to_runs
 from factors.pose_kernel import logarithms
 
+_ABSORBED = [COUNTS.index(name) for name in ("given", "used", "absorbed")]
 _LAST_FRAMES = 20  # of which it is kept whether they agree with the estimate
 _UNUSUAL = 25.0  # squared sigmas of a six-vector
 _TOTAL_KEPT = 1 - 1 / 2000  # of the total scatter, from frame to frame
@@ -63,6 +64,7 @@ def absorb(state: State, gated: Mapping[int, Gated]) -> None:
     numbers = np.concatenate([one.raw.frame_numbers for one in kept.values()])
     rows = np.searchsorted(state.numbers, numbers)
     state.sums = state.sums.replace_at((rows, cameras), sums_of(state, kept))
+    state.counts = state.counts.copy()
     for camera, one in kept.items():
         agreed = ((number, True) for number in one.raw.frame_numbers.tolist())
         state.put(
@@ -70,8 +72,7 @@ def absorb(state: State, gated: Mapping[int, Gated]) -> None:
             matches=(*state.matches[camera], one),
             agreements=(*state.agreements[camera], *agreed)[-_LAST_FRAMES:],
         )
-        used = int(one.counts.sum())
-        state.count(camera, given=len(one.inliers), used=used, absorbed=one.raw.frames)
+        state.counts[camera, _ABSORBED] += [len(one.inliers), int(one.counts.sum()), one.raw.frames]
 
 
 def sums_of(state: State, gated: Mapping[int, Gated]) -> Sums:
@@ -268,7 +269,7 @@ def start_cameras(state: State, table: Correspondences, seen: Collection[int]) -
 
 
 def _try_to_start(state: State, camera: int) -> tuple[str, ...]:
-    """Start a camera by the batch solve of its first frames, or tell why not."""
+    """Start a camera by the batch solve of its first frames; the reasons if it fails."""
     name = state.names[camera]
     rig = Rig(lidar=state.rig.lidar, cameras={name: state.rig.cameras[name]})
     try:

@@ -143,18 +143,15 @@ class Terms:
 
     def eliminate(self, weights: Array, chain: Array) -> Eliminated:
         """The places without their poses, for (P, 1 + n) weights in the loss."""
-        at_place, pull = self.at_place / weights[:, 1:, None, None], self._pull
-        hessian, gradient, cameras = soften(self.information, pull, at_place, np.zeros(6))
+        at_place = self.at_place / weights[:, 1:, None, None]
+        pull = -(self.information @ self.minimum[..., None])[..., 0]
+        hessian, gradient, cameras = soften(self.information, pull, at_place)
         by = chain.reshape(-1, 6, chain.shape[1])
         hessian = (by.swapaxes(1, 2) @ hessian @ by).sum(axis=1)
         gradient = gradient.reshape(-1, len(chain)) @ chain
         cloud = self.cloud / weights[:, :1, None]
-        hessian, gradient, of_cloud = soften(hessian, gradient, cloud, np.zeros(6))
+        hessian, gradient, of_cloud = soften(hessian, gradient, cloud)
         return Eliminated(hessian.sum(axis=0), gradient.sum(axis=0), of_cloud, cameras, by)
-
-    @cached_property
-    def _pull(self) -> Array:
-        return np.asarray(-(self.information @ self.minimum[..., None])[..., 0])
 
     def squared(self, u: Array, v: Array) -> Array:
         """(P, 1 + n) squared sigmas of such displacements, in a loss that is not robust."""
@@ -185,8 +182,8 @@ class Terms:
 class Eliminated(NamedTuple):
     """Some places without their poses (``calibgraph.solver.places``).
 
-    What is left is a quadratic on the cloud's and the cameras' shared steps. It knows them by
-    where matches show the cameras, r: the rows of ``by``.
+    What is left is a quadratic in the steps of the cloud and of the cameras that all places share.
+    It depends on them through r, where matches show the cameras.
 
     Attributes:
         hessian: (6 + 6 n, 6 + 6 n) sum over the places.

@@ -195,7 +195,8 @@ class PlaceSums:
     @property
     def visited(self) -> list[int]:
         """The rows that have frames."""
-        return [*map(int, np.flatnonzero(self.frames.any(axis=1)))]
+        found: list[int] = np.nonzero(self.frames.any(axis=1))[0].tolist()
+        return found
 
     @property
     def count(self) -> float:

@@ -314,7 +314,9 @@ def _preprocessed(
         if end - first >= MIN_MATCHES:
             block = camera_block(cameras[camera], usable.select(rows[first:end]), config)
             enough = block.frame_counts >= MIN_MATCHES
-            if enough.any():
+            if enough.all():
+                found[camera] = block
+            elif enough.any():
                 found[camera] = block.select(np.repeat(enough, block.frame_counts))
     return group, table, repeated, found
 

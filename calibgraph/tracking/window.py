@@ -77,15 +77,14 @@ class Window:
         self.values = self._isam.calculateBestEstimate()  # by all changes, however small
 
     def _factor(self, hessian: Array, vector: Array) -> gtsam.HessianFactor:
-        """The quadratic as one factor, from those of single variables and of pairs."""
-        parts, keys = gtsam.GaussianFactorGraph(), self._keys
-        rows = [slice(_POSE * i, _POSE * i + _POSE) for i in range(len(keys))]
-        none, zero = np.zeros((_POSE, _POSE)), np.zeros(_POSE)
-        for key, own in zip(keys, rows, strict=True):
-            parts.push_back(gtsam.HessianFactor(key, hessian[own, own], vector[own], 0.0))
-        for (a, one), (b, two) in combinations(zip(keys, rows, strict=True), 2):
+        """The quadratic as one factor, from those of pairs that share what is of one variable."""
+        parts, share = gtsam.GaussianFactorGraph(), 1.0 / (len(self._keys) - 1)
+        rows = [slice(_POSE * i, _POSE * i + _POSE) for i in range(len(self._keys))]
+        for (a, one), (b, two) in combinations(zip(self._keys, rows, strict=True), 2):
+            own, other = (share * hessian[at, at] for at in (one, two))
+            pulls = share * vector[one], share * vector[two]
             parts.push_back(
-                gtsam.HessianFactor(a, b, none, hessian[one, two], zero, none, zero, 0.0)
+                gtsam.HessianFactor(a, b, own, hessian[one, two], pulls[0], other, pulls[1], 0.0)
             )
         return gtsam.HessianFactor(parts)
 

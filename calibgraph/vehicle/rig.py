@@ -34,7 +34,7 @@ from calibgraph.vehicle.lidars import (
 from calibgraph.vehicle.motion import REACH_M, Drive, Instant
 from calibgraph.vehicle.planes import View, Views, look
 from calibgraph.vehicle.start import locate_lidars
-from calibgraph.vehicle.travel import POSE_FILES, Travel, direction_of_travel, read_poses
+from calibgraph.vehicle.travel import POSE_FILES, direction_of_travel, read_poses
 
 MOST_INSTANTS = 20
 """Of a recording, spread over it: more hardly narrow what places differ by."""
@@ -143,7 +143,8 @@ def calibrate_rig_lidars(
     vehicle = None
     if rig.vehicle is not None:
         progress("finding the vehicle's frame", 0, 1)
-        vehicle, unknown = find_vehicle(rig.vehicle, _road(clouds, poses), _travel(path))
+        travel = None if path is None else direction_of_travel(read_poses(path)[0])
+        vehicle, unknown = find_vehicle(rig.vehicle, _road(clouds, poses), travel)
         warnings += unknown
     for line in warnings:
         _log.warning(line)
@@ -268,11 +269,6 @@ def _pose_file(dataset: Dataset) -> Path | None:
     """Of the poses beside the data; None without any."""
     paths = (folder / name for folder in dataset.folders for name in POSE_FILES)
     return next((path for path in paths if path.is_file()), None)
-
-
-def _travel(poses: Path | None) -> Travel | None:
-    """The direction of travel; None without poses."""
-    return None if poses is None else direction_of_travel(read_poses(poses)[0])
 
 
 def _usable(instants: Sequence[Instant]) -> tuple[list[Instant], list[str]]:

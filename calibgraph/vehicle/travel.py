@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calibgraph.arrays import Array
@@ -152,13 +151,7 @@ def _stretches(T_world_lidar: Array) -> Iterator[Array]:
         if last >= len(along):
             return
         way = ((positions[last] - positions[first]) @ rotations[first : last + 1]).mean(axis=0)
-        turn = Rotation.from_matrix(rotations[first].T @ rotations[last]).as_rotvec()
-        largest = _turn(rotations[first : last + 1])
-        yield np.array([*way, *turn, largest])
+        every = Rotation.from_matrix(rotations[first].T @ rotations[first : last + 1])
+        largest = every.magnitude().max()
+        yield np.array([*way, *every[-1].as_rotvec(), largest])
         first = last if largest <= _MOST_TURN else first + max(1, (last - first) // 4)
-
-
-def _turn(rotations: NDArray[np.float64]) -> float:
-    """The largest angle [rad] of rotations against their first."""
-    traces = np.einsum("ij,nij->n", rotations[0], rotations)
-    return float(np.arccos(np.clip((traces.min() - 1.0) / 2.0, -1.0, 1.0)))

@@ -21,7 +21,6 @@ from calibgraph.matching.cmrnext.correlation import (
 FULL_WIDTH = 64
 """Channels of the published networks' first layer; every other width follows it in proportion."""
 
-_RGB = 3
 _MAX_WIDTH = 256
 SIZE_MULTIPLE, SIZE_MIN = 64, 128
 CELL = 8
@@ -70,11 +69,6 @@ class Architecture:
     def lidar_channels(self) -> int:
         """Channels of the LiDAR input: 2L + 1, or 1 without encoding; 1 more with reflectance."""
         return 2 * max(self.fourier_levels, 0) + 1 + self.reflectance
-
-    @property
-    def context_channels(self) -> int:
-        """Channels of the context encoder's input."""
-        return self.lidar_channels if self.context == "lidar" else _RGB
 
     def scale(self, channels: int) -> int:
         """A layer's channels, scaled from the published width."""
@@ -252,7 +246,8 @@ class CmrNext(nn.Module):
         self.fnet_lidar = Encoder(
             architecture, architecture.lidar_channels, features, nn.InstanceNorm2d
         )
-        self.cnet = Encoder(architecture, architecture.context_channels, 2 * hidden, nn.BatchNorm2d)
+        read = architecture.lidar_channels if architecture.context == "lidar" else 3
+        self.cnet = Encoder(architecture, read, 2 * hidden, nn.BatchNorm2d)
         self.update_block = UpdateBlock(architecture)
 
     def forward(self, rgb: Tensor, lidar: Tensor, *, iterations: int = 12) -> Flow:

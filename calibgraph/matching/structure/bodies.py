@@ -7,7 +7,7 @@ import numpy as np
 
 from calibgraph.arrays import Array
 from calibgraph.model.geometry import invert, relative_transform
-from calibgraph.model.rig import Camera, RelativePose, Rig
+from calibgraph.model.rig import Camera, Rig
 
 Body = Mapping[str, Camera]
 """Cameras with fixed relative poses; the extrinsic of the first is the pose of the body."""
@@ -19,32 +19,22 @@ remaining error camera by camera."""
 
 def rigid_bodies(rig: Rig) -> list[Body]:
     """The cameras of a rig in bodies, the first of each at its guess."""
-    tight = [
-        pair
+    steps = [
+        step
         for pair in rig.relative_poses
         if pair.rotation_sigma_rad <= RIGID_RAD and pair.translation_sigma_m <= RIGID_M
+        for step in ((pair.a, pair.b, invert(pair.T_a_b)), (pair.b, pair.a, pair.T_a_b))
     ]
     left = dict(rig.cameras)
     bodies: list[Body] = []
     while left:
         name = next(iter(left))
         body = {name: left.pop(name)}
-        while pair := next((p for p in tight if _one_side(p, body, left)), None):
-            new, T = _other_side(pair, body)
-            body[new] = left.pop(new).moved_to(T)
+        while step := next((s for s in steps if s[0] in body and s[1] in left), None):
+            known, new, T_new_known = step
+            body[new] = left.pop(new).moved_to(T_new_known @ body[known].T_camera_lidar)
         bodies.append(body)
     return bodies
-
-
-def _one_side(pair: RelativePose, body: Body, left: Body) -> bool:
-    return (pair.a in body and pair.b in left) or (pair.b in body and pair.a in left)
-
-
-def _other_side(pair: RelativePose, body: Body) -> tuple[str, Array]:
-    """The camera of a pair that is not in a body yet, and its T_camera_lidar."""
-    if pair.a in body:
-        return pair.b, invert(pair.T_a_b) @ body[pair.a].T_camera_lidar
-    return pair.a, pair.T_a_b @ body[pair.b].T_camera_lidar
 
 
 def lead(body: Body) -> Camera:

@@ -130,7 +130,8 @@ class PoseSearch:
         All candidates of the box search are refined, after an approach and without one, which may
         lead away from the right pose, but not twice at one pose.
         """
-        maps = self._correlate(_turn_about_axis(body, roll_rad), effort)
+        rolled = transform(Rotation.from_rotvec([0.0, 0.0, roll_rad])) @ lead(body).T_camera_lidar
+        maps = self._correlate(place(body, rolled), effort)
         nothing = Candidate(body, -math.inf)
         if not maps.maps:
             return nothing
@@ -183,7 +184,10 @@ class PoseSearch:
         These are as alike to the clouds as images of other places of the kind. For one roll: the
         acceptance counts the searches.
         """
-        frames = {name: _mirror(one) for name, one in self._frames.items()}
+        frames = {
+            name: replace(one, grays=[gray.mirrored() for gray in one.grays])
+            for name, one in self._frames.items()
+        }
         search = PoseSearch(
             self.rig, frames, self._range, seed=self._seed, out_of_time=self.out_of_time
         )
@@ -297,16 +301,5 @@ def is_accepted(candidate: Candidate, tries: float) -> bool:
     return candidate.z_score >= least_z_score(tries)
 
 
-def _mirror(frames: CameraFrames) -> CameraFrames:
-    """The frames with the images' left and right swapped."""
-    return replace(frames, grays=[gray.mirrored() for gray in frames.grays])
-
-
 def _by_z_score(candidate: Candidate) -> float:
     return candidate.z_score
-
-
-def _turn_about_axis(body: Body, angle_rad: float) -> Body:
-    """The body after a turn about the axis of its lead."""
-    turn = transform(Rotation.from_rotvec([0.0, 0.0, angle_rad]))
-    return place(body, turn @ lead(body).T_camera_lidar)

@@ -97,8 +97,14 @@ def score_windows(
     )  # fmt: skip
 
 
-@compiled()
-def centre_grids(shape, places, counts, group, origin, grids):  # type: ignore[no-untyped-def]
+def centre_grids(
+    shape: NDArray[np.int64],
+    places: NDArray[np.int32],
+    counts: NDArray[np.int32],
+    group: NDArray[np.int32],
+    origin: NDArray[np.int64],
+    grids: NDArray[np.float32],
+) -> None:
     """Subtract the mean score of a window from each grid, as often as windows are in the image.
 
     A window that leaves the image counts 0, as an unrelated one does in the mean: subtracted from
@@ -107,27 +113,27 @@ def centre_grids(shape, places, counts, group, origin, grids):  # type: ignore[n
 
     shape: height and width of the image; the others as of :func:`score_windows`.
     """
-    (height, width), (rows, columns) = shape, grids.shape[1:]
-    inside = np.zeros((rows, columns), np.float32)
+    inside = np.zeros_like(grids)
+    _count_inside(shape, places, counts, group, origin, inside)
+    seen = np.maximum(inside.sum(axis=(1, 2), keepdims=True), 1)
+    grids -= inside * (grids.sum(axis=(1, 2), keepdims=True) / seen)
+
+
+@compiled()
+def _count_inside(shape, places, counts, group, origin, inside):  # type: ignore[no-untyped-def]
+    """Count, at each shift, the windows of each group that are in the image."""
+    height, width, x, y = shape[0], shape[1], origin[0], origin[1]
     for w in range(len(places)):
         left, top = places[w, 0, 0], places[w, 0, 1]
-        right, bottom = left, top
+        right, bottom, grid = left, top, inside[group[w]]
         for p in range(counts[w]):
             u, v = places[w, p, 0], places[w, p, 1]
             left, right = u if u < left else left, u if u > right else right
             top, bottom = v if v < top else top, v if v > bottom else bottom
-        for row in range(rows):
-            for column in range(columns):
-                right_by, down_by = origin[0] + column, origin[1] + row
-                inside[row, column] += (
-                    (left + right_by >= 0) & (right + right_by < width)
-                    & (top + down_by >= 0) & (bottom + down_by < height)
-                )  # fmt: skip
-        if w + 1 == len(places) or group[w + 1] != group[w]:
-            grid, seen = grids[group[w]], inside.sum()
-            if seen > 0:
-                grid -= inside * (grid.sum() / seen)
-            inside[:] = 0
+        for row in range(grid.shape[0]):
+            if top + y + row >= 0 and bottom + y + row < height:
+                for column in range(grid.shape[1]):
+                    grid[row, column] += (left + x + column >= 0) & (right + x + column < width)
 
 
 def _aligned(size: int) -> NDArray[np.float32]:

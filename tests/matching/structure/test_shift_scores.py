@@ -142,7 +142,7 @@ def test_windows_that_tell_nothing_do_not_hold_a_group_in_the_image() -> None:
         grids[:, row, column] = 0.3 * np.bincount(group, inside, minlength=3)
     assert np.ptp(grids[:2]) > 1 and np.ptp(grids[2]) == 0
     grids[2, 4, 6] += 1
-    centre_grids((20, 30), places.astype(np.int32), counts, group, origin, grids)
+    centre_grids(np.array([20, 30]), places.astype(np.int32), counts, group, origin, grids)
     np.testing.assert_allclose(grids[:2], 0, atol=1e-5)
     assert grids[2, 4, 6] - grids[2, 0, 0] == pytest.approx(1)
     np.testing.assert_allclose(grids.mean(axis=(1, 2)), 0, atol=1e-5)
