@@ -166,7 +166,8 @@ def test_lidars_that_share_nothing_are_joined_by_motion(tmp_path, caplog):
     turned = Rotation.from_matrix(T[:3, :3] @ truth[:3, :3].T).as_rotvec(degrees=True)
     off_cm = 100 * (T[:3, 3] - truth[:3, 3])
     assert np.abs(turned).max() < 0.05 and (np.abs(turned) < 3 * degrees).all()
-    assert np.abs(off_cm).max() < 2.0 and (np.abs(off_cm) < 3 * centimetres).all()
+    # Two places leave the direction along the street open: it is somewhere within its bar.
+    assert np.abs(off_cm[1:]).max() < 2.0 and (np.abs(off_cm) < 3 * centimetres).all()
 
 
 def test_lidars_that_share_nothing_are_refused_where_the_motion_is_unknown(tmp_path):
