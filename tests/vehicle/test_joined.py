@@ -1,5 +1,6 @@
 """Cameras with the clouds of several LiDARs, and LiDARs that only cameras join."""
 
+import copy
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
@@ -24,10 +25,13 @@ from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError
 from calibgraph.io.dataset import Dataset
 from calibgraph.io.frame import Frame, ScanMotion, frame_of_entry
+from calibgraph.matching.named import find_matcher
+from calibgraph.matching.protocol import FullMatcher
 from calibgraph.model.config import Config
 from calibgraph.model.geometry import invert, move_points, retract_all, transform, twist_between
 from calibgraph.model.rig import Lidar
 from calibgraph.vehicle.joined import (
+    JoinedMatcher,
     errors_by_lidars,
     join_clouds,
     joint_covariance,
@@ -269,6 +273,17 @@ def test_cameras_that_the_base_does_not_show_are_calibrated_to_all_lidars(
     assert np.abs(result.joint_covariance[:n, n:]).max() > 0
     again = calibgraph.load_calibration(result.save(tmp_path / "out"))
     assert frame_of_entry(again.frames[0]).joined.keys() == {"low"}
+
+
+def test_a_matcher_on_joined_clouds_is_the_matcher_in_all_else():
+    inner = find_matcher("structure")
+    joined = JoinedMatcher(inner, poses_of(T_TOP_LOW))
+    assert FullMatcher(joined).rounds == inner.rounds > 1
+    assert copy.copy(joined).rounds == inner.rounds
+    assert joined.with_estimate(("offset",)) is not joined
+    table = simulate_correspondences(make_pair(), frames=1, matches=10)
+    of_table = JoinedMatcher(find_matcher(table), poses_of(T_TOP_LOW))
+    assert of_table.with_estimate(("offset",)) is of_table
 
 
 def test_clouds_are_joined_only_where_cameras_gain(tmp_path: Path):
