@@ -59,6 +59,7 @@ from calibgraph.trust.lens_checks import intrinsics_checks
 from calibgraph.trust.matcher_checks import last_round_checks, matcher_checks
 from calibgraph.trust.solution_checks import estimate_checks, outlier_frame_checks
 from calibgraph.trust.thresholds import threshold
+from calibgraph.vehicle.joined import JoinedMatcher, join_clouds
 
 _log = logging.getLogger(__name__)
 
@@ -116,8 +117,6 @@ def check(
     deployed = loaded.model_copy(update={"relative_poses": ()})
     given = dataset if isinstance(dataset, Dataset) else load_dataset(dataset, deployed)
     same_recording, verdict = (False, None) if isinstance(rig, Rig) else provenance(rig, given)
-    with watch("choose_frames"):
-        data = _open(given, deployed, full) if deployed.cameras else given
     lidars = None
     if deployed.other_lidars:
         sensors = len(deployed.cameras) + len(deployed.other_lidars)
@@ -125,6 +124,11 @@ def check(
             lidars = measure_lidars(
                 deployed, given, Config(seed=seed), tolerance, sensors=sensors, progress=report
             )
+            if lidars.poses is not None:
+                given, line = join_clouds(given, deployed, lidars.poses, Config().tolerance)
+                full = FullMatcher(JoinedMatcher(full, lidars.poses)) if line else full
+    with watch("choose_frames"):
+        data = _open(given, deployed, full) if deployed.cameras else given
     cameras, evidence = dict[str, CameraAudit](), None
     if deployed.cameras:
         cameras, evidence = _measure_cameras(

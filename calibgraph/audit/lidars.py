@@ -27,7 +27,7 @@ from calibgraph.model.config import Config
 from calibgraph.model.geometry import invert, twist_between
 from calibgraph.model.rig import Rig
 from calibgraph.progress import Progress
-from calibgraph.vehicle.lidars import PLACE_FREEDOM
+from calibgraph.vehicle.lidars import PLACE_FREEDOM, LidarPoses
 from calibgraph.vehicle.rig import LidarResult, calibrate_rig_lidars
 
 _LEAST_FREEDOM = 3.0  # of one place, where the size is a prior
@@ -43,12 +43,14 @@ class MeasuredLidars:
         deviation: (6 k,) of all, as of an audit; empty if they could not be measured.
         covariance: (6 k, 6 k) of it.
         T_lidar_base: (4, 4) each, as deployed.
+        poses: as measured; None if they could not be.
     """
 
     audits: dict[str, CameraAudit]
     deviation: Array
     covariance: Array
     T_lidar_base: list[Array]
+    poses: LidarPoses | None = None
 
 
 def measure_lidars(
@@ -103,7 +105,8 @@ def measure_lidars(
         audits[name] = CameraAudit(
             status, reason, deviations[row], sigma, detectable(sigma, limits.confident)
         )
-    return MeasuredLidars(audits, np.concatenate(deviations), covariance, T_lidar_base)
+    deviation = np.concatenate(deviations)
+    return MeasuredLidars(audits, deviation, covariance, T_lidar_base, found.poses)
 
 
 def freedom_of_places(places: int, lidars: int) -> float:

@@ -77,7 +77,7 @@ def join_clouds(
         replace(f, joined={n: T for n, T in joined.items() if n in f.lidar_paths}, kept=None)
         for f in data.frames
     )
-    if not any(frame.joined for frame in frames):
+    if not rig.cameras or not any(frame.joined for frame in frames):
         return data, ""
     shares = _shares_of_base(spread_out(frames, _FRAMES), rig)
     poor = {name: share for name, share in shares.items() if share < _LEAST_SEEN}

@@ -271,8 +271,14 @@ def test_cameras_that_the_base_does_not_show_are_calibrated_to_all_lidars(
     assert np.abs(off / np.sqrt(np.diag(result.rig.lidars["low"].covariance))[3:]).max() < 4
     n = len(result.joint_covariance) - 6
     assert np.abs(result.joint_covariance[:n, n:]).max() > 0
-    again = calibgraph.load_calibration(result.save(tmp_path / "out"))
+    path = result.save(tmp_path / "out")
+    again = calibgraph.load_calibration(path)
     assert frame_of_entry(again.frames[0]).joined.keys() == {"low"}
+    if from_deg < upto_deg:  # else planes do not measure the LiDAR again
+        audit = calibgraph.check(path, tmp_path)
+        assert {n: audit.cameras[n].status for n in audit.cameras} == dict.fromkeys(
+            truth.cameras, "OK"
+        )
 
 
 def test_a_matcher_on_joined_clouds_is_the_matcher_in_all_else():
