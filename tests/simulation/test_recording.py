@@ -111,10 +111,11 @@ def test_the_command_in_the_readme_makes_the_sample(call: Call, tmp_path: Path) 
     assert len(made.frames) == len(kept.frames) == 6
     for new, old in zip(made.frames, kept.frames, strict=True):
         # The ray caster is float32 to 80 m: 1e-5 m; another processor may round otherwise, and
-        # where the paint has an edge, a point that moved so far has another intensity.
+        # where the paint has an edge, a point that moved so far has another intensity: up to 14
+        # of 12,315 on one processor. Of another seed nearly all have.
         clouds = [frame.load_cloud() for frame in (new, old)]
         np.testing.assert_allclose(clouds[0][:, :3], clouds[1][:, :3], atol=1e-4)
-        assert np.mean(np.abs(clouds[0][:, 3] - clouds[1][:, 3]) > 1e-4) < 1e-3
+        assert np.mean(np.abs(clouds[0][:, 3] - clouds[1][:, 3]) > 1e-4) < 5e-3
         for name, camera in kept.rig.cameras.items():
             levels = [frame.load_image(name, camera).astype(int) for frame in (new, old)]
             assert (
