@@ -21,7 +21,7 @@ from calibgraph.elsewhere import go_on_elsewhere
 from calibgraph.io.clouds import describe_thinned
 from calibgraph.io.dataset import Dataset, load_dataset
 from calibgraph.io.tables import load_correspondences
-from calibgraph.matching.named import find_matcher
+from calibgraph.matching.named import find_matcher, is_table
 from calibgraph.model.calibration import Calibration, Later
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.clock import odd_motions, unused_times
@@ -89,14 +89,19 @@ def calibrate(
     rig, lidars = (rig if rig and data is dataset else data.rig), None
     config, joined = config or Config(), ""
     if rig.other_lidars:
+        has_clouds = bool(rig.cameras) and not is_table(matcher)
+
+        def alone(data: Dataset, rig: Rig) -> Calibration:
+            return calibrate(
+                data, rig, matcher, config, terms=terms, time_limit_s=time_limit_s,
+                progress=progress,
+            )  # fmt: skip
+
         with watch("lidars"):
-
-            def alone(data: Dataset, rig: Rig) -> Calibration:
-                return calibrate(data, rig, matcher, config, terms=terms, progress=progress)
-
-            place = partial(place_by_cameras, alone, data, rig) if rig.cameras else None
+            place = partial(place_by_cameras, alone, data, rig) if has_clouds else None
             lidars = calibrate_rig_lidars(data, rig, config, place=place, progress=report)
-            data, joined = join_clouds(data, rig, lidars.poses, config.tolerance)
+            if has_clouds:
+                data, joined = join_clouds(data, rig, lidars.poses, config.tolerance)
         if joined:
             _log.info(joined)
             matcher = JoinedMatcher(find_matcher(matcher, seed=config.seed), lidars.poses)

@@ -28,7 +28,7 @@ from calibgraph.io.frame import hash_source
 from calibgraph.io.rigs import load_rig
 from calibgraph.matching.burnt_in import describe_burnt_in, hide_burnt_in
 from calibgraph.matching.frame_choice import CANDIDATES, without_copies
-from calibgraph.matching.named import find_matcher
+from calibgraph.matching.named import find_matcher, is_table
 from calibgraph.matching.protocol import FullMatcher
 from calibgraph.matching.run import MatchingRun
 from calibgraph.matching.same_images import require_different_images
@@ -124,7 +124,7 @@ def check(
             lidars = measure_lidars(
                 deployed, given, Config(seed=seed), tolerance, sensors=sensors, progress=report
             )
-            if lidars.poses is not None:
+            if lidars.poses is not None and not is_table(matcher):
                 given, line = join_clouds(given, deployed, lidars.poses, Config().tolerance)
                 full = FullMatcher(JoinedMatcher(full, lidars.poses)) if line else full
     with watch("choose_frames"):

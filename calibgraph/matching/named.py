@@ -37,6 +37,13 @@ class TableMatcher:
         return self.table.select(np.isin(self.table.frame, frames))
 
 
+def is_table(matcher: Matcher | Correspondences | Path | str) -> bool:
+    """Whether it is a table, whose points stay where they are, whatever clouds are given."""
+    if isinstance(matcher, (str, Path)):
+        return Path(matcher).suffix in (".parquet", ".csv")
+    return isinstance(matcher, Correspondences)
+
+
 def find_matcher(matcher: Matcher | Correspondences | Path | str, *, seed: int = 0) -> FullMatcher:
     """Find a matcher, and complete it with the defaults of the protocol.
 
@@ -50,7 +57,7 @@ def find_matcher(matcher: Matcher | Correspondences | Path | str, *, seed: int =
         return FullMatcher(matcher)
     if str(matcher) == "structure":
         return FullMatcher(structure_matcher(seed=seed))
-    if Path(matcher).suffix in (".parquet", ".csv"):
+    if is_table(matcher):
         return FullMatcher(TableMatcher(load_correspondences(matcher)))
     if str(matcher) == "cmrnext":
         raise ValueError(

@@ -38,6 +38,7 @@ from calibgraph.vehicle.joined import (
     place_by_cameras,
 )
 from calibgraph.vehicle.lidars import LidarPoses
+from calibgraph.vehicle.rig import LidarResult
 from tests.conftest import SAMPLE, make_pair
 
 T_TOP_LOW = transform(Rotation.from_euler("ZYX", [70, 5, -3], degrees=True), [0.8, -0.4, -0.5])
@@ -290,6 +291,25 @@ def test_a_matcher_on_joined_clouds_is_the_matcher_in_all_else():
     table = simulate_correspondences(make_pair(), frames=1, matches=10)
     of_table = JoinedMatcher(find_matcher(table), poses_of(T_TOP_LOW))
     assert of_table.with_estimate(("offset",)) is of_table
+
+
+@pytest.mark.parametrize("named", [False, True])
+def test_tables_place_no_lidar_and_join_no_clouds(
+    named: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Their points are of one LiDAR: both sides would be the same."""
+    data = split_sample(tmp_path, 10.0, 10.0)
+    table, asked = simulate_correspondences(data.rig, frames=6, matches=50), []
+
+    def found(*_: object, place: object, **__: object) -> LidarResult:
+        asked.append(place)
+        return LidarResult(None, poses_of(T_TOP_LOW), {}, ())
+
+    monkeypatch.setattr("calibgraph.pipeline.calibrate_rig_lidars", found)
+    table.save(tmp_path / "table.parquet")
+    result = calibgraph.calibrate(data, matcher=tmp_path / "table.parquet" if named else table)
+    assert asked == [None]
+    assert not any("joined" in line for line in result.warnings)
 
 
 def test_clouds_are_joined_only_where_cameras_gain(tmp_path: Path):
