@@ -29,7 +29,7 @@ CASES = ((1, 1, 100), (1, 10, 200), (20, 1, 50), (20, 10, 100), (200, 1, 10), (2
 
 
 def processor_s(server: Server) -> Array:
-    """Of the workers, of those too that have ended, the server and this process so far."""
+    """Of all workers, running or ended, of the server and of this process so far."""
     own = server.process.cpu_times()
     workers = [one.cpu_times() for one in server.process.children(recursive=True)]
     of_workers = sum(sum(each[:4]) for each in workers) + sum(own[2:4])

@@ -224,7 +224,7 @@ class Frame:
         return np.column_stack([points, cloud[:, 3]]).astype(np.float32)
 
     def _join(self, base: NDArray[np.float32]) -> NDArray[np.float32]:
-        """The base's cloud and those of others, each with the ranks of its own intensities."""
+        """The clouds of the base and of other LiDARs; intensities are ranks within each cloud."""
         parts = [base, *(of for n in self.joined if (of := self.load_in_base(n)) is not None)]
         for part in parts:
             ordered, own = np.sort(part[:, 3]), part[:, 3].copy()
