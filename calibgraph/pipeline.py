@@ -21,7 +21,7 @@ from calibgraph.elsewhere import go_on_elsewhere
 from calibgraph.io.clouds import describe_thinned
 from calibgraph.io.dataset import Dataset, load_dataset
 from calibgraph.io.tables import load_correspondences
-from calibgraph.matching.named import find_matcher, is_table
+from calibgraph.matching.named import is_table
 from calibgraph.model.calibration import Calibration, Later
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.clock import odd_motions, unused_times
@@ -40,12 +40,7 @@ from calibgraph.trust.inputs import registered_twists
 from calibgraph.trust.lens_checks import asks_offset
 from calibgraph.trust.probability import STRUCTURE, TABLES, judge
 from calibgraph.trust.solution_checks import residuals_of, weaknesses
-from calibgraph.vehicle.joined import (
-    JoinedMatcher,
-    join_clouds,
-    joint_covariance,
-    place_by_cameras,
-)
+from calibgraph.vehicle.joined import join_clouds, joint_covariance, place_by_cameras
 from calibgraph.vehicle.rig import LidarResult, calibrate_rig_lidars
 
 _log = logging.getLogger(__name__)
@@ -89,22 +84,10 @@ def calibrate(
     rig, lidars = (rig if rig and data is dataset else data.rig), None
     config, joined = config or Config(), ""
     if rig.other_lidars:
-        has_clouds = bool(rig.cameras) and not is_table(matcher)
-
-        def alone(data: Dataset, rig: Rig) -> Calibration:
-            return calibrate(
-                data, rig, matcher, config, terms=terms, time_limit_s=time_limit_s,
-                progress=progress,
-            )  # fmt: skip
-
         with watch("lidars"):
-            place = partial(place_by_cameras, alone, data, rig) if has_clouds else None
-            lidars = calibrate_rig_lidars(data, rig, config, place=place, progress=report)
-            if has_clouds:
-                data, joined = join_clouds(data, rig, lidars.poses, config.tolerance)
-        if joined:
-            _log.info(joined)
-            matcher = JoinedMatcher(find_matcher(matcher, seed=config.seed), lidars.poses)
+            data, lidars, joined = find_lidars(
+                data, rig, matcher, config, terms=terms, time_limit_s=time_limit_s, progress=report
+            )
     if lidars is not None and not rig.cameras:
         with watch("hash_inputs"):
             hashes = hash_inputs(data)
@@ -145,6 +128,30 @@ def calibrate(
     return (
         result if lidars is None else _with_lidars(result, lidars, run.solution.by_lidars, joined)
     )
+
+
+def find_lidars(
+    data: Dataset, rig: Rig, matcher: AnyMatcher, config: Config, *, terms: Terms = "full",
+    time_limit_s: float | None = None, progress: Progress,
+) -> tuple[Dataset, LidarResult, str]:  # fmt: skip
+    """The LiDARs of a rig; the dataset, their clouds joined where cameras gain, and why in a line.
+
+    Arguments as of :func:`calibrate`. Those that share too little are placed by its cameras.
+    """
+    has_clouds = bool(rig.cameras) and not is_table(matcher)
+
+    def alone(data: Dataset, rig: Rig) -> Calibration:
+        return calibrate(
+            data, rig, matcher, config, terms=terms, time_limit_s=time_limit_s, progress=progress
+        )
+
+    place = partial(place_by_cameras, alone, data, rig) if has_clouds else None
+    lidars, joined = calibrate_rig_lidars(data, rig, config, place=place, progress=progress), ""
+    if has_clouds:
+        data, joined = join_clouds(data, rig, lidars.poses, config.tolerance)
+    if joined:
+        _log.info(joined)
+    return data, lidars, joined
 
 
 def _without_cameras(rig: Rig, config: Config, terms: Terms) -> Calibration:

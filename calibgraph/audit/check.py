@@ -28,7 +28,7 @@ from calibgraph.io.frame import hash_source
 from calibgraph.io.rigs import load_rig
 from calibgraph.matching.burnt_in import describe_burnt_in, hide_burnt_in
 from calibgraph.matching.frame_choice import CANDIDATES, without_copies
-from calibgraph.matching.named import find_matcher, is_table
+from calibgraph.matching.named import find_matcher
 from calibgraph.matching.protocol import FullMatcher
 from calibgraph.matching.run import MatchingRun
 from calibgraph.matching.same_images import require_different_images
@@ -59,7 +59,6 @@ from calibgraph.trust.lens_checks import intrinsics_checks
 from calibgraph.trust.matcher_checks import last_round_checks, matcher_checks
 from calibgraph.trust.solution_checks import estimate_checks, outlier_frame_checks
 from calibgraph.trust.thresholds import threshold
-from calibgraph.vehicle.joined import JoinedMatcher, join_clouds
 
 _log = logging.getLogger(__name__)
 
@@ -119,14 +118,10 @@ def check(
     same_recording, verdict = (False, None) if isinstance(rig, Rig) else provenance(rig, given)
     lidars = None
     if deployed.other_lidars:
-        sensors = len(deployed.cameras) + len(deployed.other_lidars)
         with watch("lidars"):
-            lidars = measure_lidars(
-                deployed, given, Config(seed=seed), tolerance, sensors=sensors, progress=report
+            given, lidars = measure_lidars(
+                deployed, given, Config(seed=seed), tolerance, matcher=matcher, progress=report
             )
-            if lidars.poses is not None and not is_table(matcher):
-                given, line = join_clouds(given, deployed, lidars.poses, Config().tolerance)
-                full = FullMatcher(JoinedMatcher(full, lidars.poses)) if line else full
     with watch("choose_frames"):
         data = _open(given, deployed, full) if deployed.cameras else given
     cameras, evidence = dict[str, CameraAudit](), None

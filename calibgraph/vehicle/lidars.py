@@ -260,7 +260,8 @@ def _per_lidar(matches: Matches, count: int) -> Array:
 
 def _require_overlap(matches: Matches, names: Sequence[str]) -> None:
     """One line if a LiDAR has too few matches."""
-    for name, count in zip(names, _per_lidar(matches, len(names)), strict=True):
+    counts = _per_lidar(matches, len(names))
+    for name, count in zip(names[::-1], counts[::-1], strict=True):  # the base shares with all
         if count < _LEAST_MATCHES:
             raise CalibrationError(
                 f"LiDAR {name!r} sees {count:.0f} planes that others see, at least "

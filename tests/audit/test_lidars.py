@@ -63,8 +63,8 @@ def measured(monkeypatch, poses: LidarPoses, deployed: Rig, tolerance: Array):
     """The audits of a recording that gives these poses."""
     verdicts = {name: judge_lidar(poses, name, TOLERANCE) for name in poses.covariance}
     found = SimpleNamespace(poses=poses, verdicts=verdicts)
-    monkeypatch.setattr(audit_of_lidars, "calibrate_rig_lidars", lambda *_, **__: found)
-    return measure_lidars(deployed, None, Config(), tolerance, sensors=2, progress=no_progress)
+    monkeypatch.setattr(audit_of_lidars, "find_lidars", lambda *_, **__: (None, found, ""))
+    return measure_lidars(deployed, None, Config(), tolerance, progress=no_progress)[1]
 
 
 @pytest.mark.parametrize("moved", ["", "front", "left"])
@@ -85,13 +85,13 @@ def test_lidars_that_overlap_too_little_cannot_be_told_and_unknown_ones_are_refu
     def fail(*_: object, **__: object) -> None:
         raise CalibrationError("LiDAR 'left' sees 3 planes")
 
-    monkeypatch.setattr(audit_of_lidars, "calibrate_rig_lidars", fail)
-    found = measure_lidars(deployed, None, Config(), tolerance, sensors=2, progress=no_progress)
+    monkeypatch.setattr(audit_of_lidars, "find_lidars", fail)
+    _, found = measure_lidars(deployed, None, Config(), tolerance, progress=no_progress)
     assert {of.status for of in found.audits.values()} == {"CANNOT TELL"}
     assert "sees 3 planes" in found.audits["left"].reason
     unknown = deployed.model_copy(update={"lidars": {**deployed.lidars, "left": Lidar()}})
     with pytest.raises(RigError, match=r"lidars.left: has no T_base_lidar"):
-        measure_lidars(unknown, None, Config(), tolerance, sensors=2, progress=no_progress)
+        measure_lidars(unknown, None, Config(), tolerance, progress=no_progress)
 
 
 @pytest.mark.parametrize("moved", ["", "front", "top"])
