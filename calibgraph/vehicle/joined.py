@@ -27,13 +27,13 @@ from calibgraph.model.calibration import Calibration
 from calibgraph.model.geometry import (
     adjoints,
     invert,
-    pose_rows,
     retract_all,
-    transform,
+    rows_of_poses,
     twist_between,
 )
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.vehicle.lidars import LidarPoses
+from calibgraph.vehicle.sums import step_twists
 
 Cloud = NDArray[np.float32]
 
@@ -81,7 +81,7 @@ def join_clouds(
 
 def lidar_errors(poses: LidarPoses) -> dict[str, Array]:
     """Per LiDAR but the base, (6, 6 k) its twist by a standard deviation of each of the errors."""
-    turns = block_diag(*(_turn_at(poses.T_base_lidar[name]) for name in poses.covariance))
+    turns = step_twists(np.array([poses.T_base_lidar[name] for name in poses.covariance]))
     each = np.split(turns @ _root(poses), len(poses.covariance))
     return dict(zip(poses.covariance, each, strict=True))
 
@@ -123,7 +123,7 @@ def place_by_cameras(
     to_base = block_diag(*adjoints(T_lidar_camera))
     covariance = to_base @ (_joint(base, found) + _joint(other, found)) @ to_base.T
     T_base_lidar, own, ratio = _mean_pose(T, covariance)
-    turn = np.linalg.inv(_turn_at(T_base_lidar))
+    turn = np.linalg.inv(step_twists(T_base_lidar[None]))
     poses, joint = {rig.lidar: np.eye(4), name: T_base_lidar}, turn @ own @ turn.T
     return LidarPoses(rig.lidar, poses, joint, {}, len(data.frames), (ratio, ratio))
 
@@ -145,8 +145,7 @@ def _joint(result: Calibration, cameras: Sequence[str]) -> Array:
     """(6 n, 6 n) of some cameras; as independent where another one is not determined."""
     if result.joint_covariance is None:
         return np.asarray(block_diag(*(result.covariance[name] for name in cameras)))
-    names = [*result.rig.cameras]
-    rows = np.concatenate([np.r_[pose_rows(names.index(name))] for name in cameras])
+    rows = rows_of_poses(cameras, [*result.rig.cameras])
     return np.asarray(result.joint_covariance[np.ix_(rows, rows)])
 
 
@@ -212,12 +211,6 @@ def _cells(camera: Camera, cloud: Cloud) -> int:
     cells = np.floor((pixels[seen] + 0.5) / size * _CELLS).astype(np.int64)
     inside = ((cells >= 0) & (cells < _CELLS)).all(axis=1)
     return len(np.unique(cells[inside], axis=0))
-
-
-def _turn_at(T_base_lidar: Array) -> Array:
-    """(6, 6) from a rotation omega and a shift of the position t to (omega, shift + t x omega)."""
-    shifted = transform(np.eye(3), T_base_lidar[:3, 3])
-    return np.asarray(adjoints(shifted[None])[0])
 
 
 def _root(poses: LidarPoses) -> Array:
