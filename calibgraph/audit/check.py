@@ -6,7 +6,6 @@ from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from calibgraph.arrays import Array
 from calibgraph.audit.judgement import (
@@ -192,24 +191,25 @@ def _judge_lidar(
     None where none is WRONG, or with a single one, which cannot be told from the LiDAR; and where
     a measurement of a camera cannot be trusted.
     """
-    deviations, covariances, poses = list[Array](), list[Array](), list[Array]()
+    deviations, poses = list[Array](), list[Array]()
+    joint, by_lidars = np.empty((0, 0)), np.empty((0, 0))
     if cameras:
         if evidence is None or evidence.joint_covariance is None:
             return None
         deviations += [deviation_of(evidence, name) for name in cameras]
-        covariances.append(evidence.joint_covariance)
+        joint, by_lidars = evidence.joint_covariance, evidence.solution.by_lidars
         poses += [evidence.guess.T_camera_lidar[name] for name in cameras]
     audits = {**cameras}
     if lidars is not None:
         if not lidars.T_lidar_base:
             return None
         deviations.append(lidars.deviation)
-        covariances.append(lidars.covariance)
+        joint = lidars.joint_with(joint, by_lidars)
         poses += lidars.T_lidar_base
         audits |= lidars.audits
     return find_lidar_motion(
         np.concatenate(deviations),
-        np.asarray(block_diag(*covariances)),
+        joint,
         poses,
         moved=[k for k, each in enumerate(audits.values()) if each.status == "WRONG"],
         quantile=Limits.of(np.inf, FALSE_ALARM_RATE / len(audits), tolerance).axis[0],

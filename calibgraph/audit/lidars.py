@@ -6,7 +6,7 @@ result have error bars, which count beside those of the measurement.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -45,12 +45,26 @@ class MeasuredLidars:
         deviation: (6 k,) of all, as of an audit; empty if they could not be measured.
         covariance: (6 k, 6 k) of it.
         T_lidar_base: (4, 4) each, as deployed.
+        by_errors: (6 k, 6 k) of the deviation by a standard deviation of each error of the poses.
     """
 
     audits: dict[str, CameraAudit]
     deviation: Array
     covariance: Array
     T_lidar_base: list[Array]
+    by_errors: Array = field(default_factory=lambda: np.empty((0, 0)))
+
+    def joint_with(self, cameras: Array, by_lidars: Array) -> Array:
+        """Covariance of the deviations of cameras and LiDARs.
+
+        Args:
+            cameras: (6 N, 6 N) of xi, with T_camera_lidar = exp(xi) estimate.
+            by_lidars: (6 N, 6 k) of it by the same errors, or (6 N, 0).
+        """
+        across = np.zeros((len(cameras), len(self.covariance)))
+        if by_lidars.size:
+            across = -by_lidars @ self.by_errors.T  # a deviation errs by -xi
+        return np.block([[cameras, across], [across.T, self.covariance]])
 
 
 def measure_lidars(
@@ -93,7 +107,12 @@ def measure_lidars(
     deviations = [
         twist_between(T, invert(now[name])) for name, T in zip(names, T_lidar_base, strict=True)
     ]
-    covariance = _covariance(found, deployed)
+    turns = [deployed.T_base_lidar[name][:3, :3].T for name in names for _ in range(2)]
+    to_own = block_diag(*turns)
+    covariance, by_errors = (
+        to_own @ _covariance(found, deployed) @ to_own.T,
+        to_own @ found.poses.root,
+    )
     freedom = freedom_of_places(found.poses.places, len(names))
     limits = Limits.of(freedom, FALSE_ALARM_RATE / sensors, tolerance)
     audits = {}
@@ -109,7 +128,7 @@ def measure_lidars(
             status, reason, deviations[row], sigma, detectable(sigma, limits.confident)
         )
     deviation = np.concatenate(deviations)
-    return data, MeasuredLidars(audits, deviation, covariance, T_lidar_base)
+    return data, MeasuredLidars(audits, deviation, covariance, T_lidar_base, by_errors)
 
 
 def freedom_of_places(places: int, lidars: int) -> float:
@@ -118,15 +137,11 @@ def freedom_of_places(places: int, lidars: int) -> float:
 
 
 def _covariance(found: LidarResult, deployed: Rig) -> Array:
-    """(6 k, 6 k) of the deviations: of the measurement and, if it is known, of what is deployed."""
-    names, joint = deployed.other_lidars, found.poses.joint_covariance.copy()
-    for row, name in enumerate(names):
-        own = (deployed.lidars or {})[name].covariance
-        if own is not None:
-            joint[6 * row : 6 * row + 6, 6 * row : 6 * row + 6] += own
-    turns = [deployed.T_base_lidar[name][:3, :3].T for name in names for _ in range(2)]
-    to_own = block_diag(*turns)
-    return np.asarray(to_own @ joint @ to_own.T)
+    """(6 k, 6 k) of all poses: of the measurement and, if it is known, of what is deployed."""
+    lidars, nothing = deployed.lidars or {}, np.zeros((6, 6))
+    bars = [lidars[name].covariance for name in deployed.other_lidars]
+    known = [nothing if bar is None else bar for bar in bars]
+    return np.asarray(found.poses.joint_covariance + block_diag(*known))
 
 
 def _doubt(found: LidarResult, name: str) -> str:

@@ -82,7 +82,7 @@ def join_clouds(
 def lidar_errors(poses: LidarPoses) -> dict[str, Array]:
     """Per LiDAR but the base, (6, 6 k) its twist by a standard deviation of each of the errors."""
     turns = step_twists(np.array([poses.T_base_lidar[name] for name in poses.covariance]))
-    each = np.split(turns @ _root(poses), len(poses.covariance))
+    each = np.split(turns @ poses.root, len(poses.covariance))
     return dict(zip(poses.covariance, each, strict=True))
 
 
@@ -213,12 +213,6 @@ def _cells(camera: Camera, cloud: Cloud) -> int:
     return len(np.unique(cells[inside], axis=0))
 
 
-def _root(poses: LidarPoses) -> Array:
-    """(6 k, 6 k) Cholesky root of the covariance of all rotations and positions."""
-    exact = 1e-18 * np.eye(len(poses.joint_covariance))  # for rounding
-    return np.asarray(np.linalg.cholesky(poses.joint_covariance + exact))
-
-
 def joint_covariance(cameras: Array, by_lidars: Array, poses: LidarPoses) -> Array:
     """(6 N + 6 k) of cameras and LiDARs, with rotations and positions of these, in the base.
 
@@ -229,5 +223,5 @@ def joint_covariance(cameras: Array, by_lidars: Array, poses: LidarPoses) -> Arr
     """
     across = np.zeros((len(cameras), len(poses.joint_covariance)))
     if by_lidars.size:
-        across = by_lidars @ _root(poses).T
+        across = by_lidars @ poses.root.T
     return np.block([[cameras, across], [across.T, poses.joint_covariance]])

@@ -84,6 +84,13 @@ class LidarPoses:
         blocks = self.joint_covariance.reshape(len(names), 6, len(names), 6)
         return {name: blocks[row, :, row] for row, name in enumerate(names)}
 
+    @property
+    def root(self) -> Array:
+        """(6 k, 6 k) Cholesky root of the joint covariance."""
+        return np.asarray(
+            np.linalg.cholesky(self.joint_covariance + _EXACT * np.eye(6 * len(self.covariance)))
+        )
+
 
 def calibrate_lidars(
     views: Views, T_base_lidar: Mapping[str, Array], *, base: str,

@@ -102,11 +102,8 @@ class Drive:
         None where the motion is unknown, or the drive begins or ends within the reach.
         """
         T_map_base = self._around(number)
-        seen, views, drift = (
-            View(np.empty((0, 3)), np.empty(0, PLANE)),
-            0,
-            {True: np.eye(4), False: np.eye(4)},
-        )
+        seen, views = View(np.empty((0, 3)), np.empty(0, PLANE)), 0
+        drift = {True: np.eye(4), False: np.eye(4)}
         for other, T_odometry in sorted(T_map_base.items(), key=lambda of: abs(of[0] - number)):
             instant = self.instant(other, [base])
             if not instant.is_usable:
