@@ -139,12 +139,10 @@ def find_lidars(
     Arguments as of :func:`calibrate`. Those that share too little are placed by its cameras.
     """
     has_clouds = bool(rig.cameras) and not is_table(matcher)
-
-    def alone(data: Dataset, rig: Rig) -> Calibration:
-        return calibrate(
-            data, rig, matcher, config, terms=terms, time_limit_s=time_limit_s, progress=progress
-        )
-
+    alone = partial(
+        calibrate, matcher=matcher, config=config, terms=terms, time_limit_s=time_limit_s,
+        progress=progress,
+    )  # fmt: skip
     place = partial(place_by_cameras, alone, data, rig) if has_clouds else None
     lidars, joined = calibrate_rig_lidars(data, rig, config, place=place, progress=progress), ""
     if has_clouds:
@@ -168,7 +166,7 @@ def _with_lidars(
     """The result with the LiDARs beside the cameras, and in one covariance with them."""
     cameras, joint = result.joint_covariance, None
     if cameras is not None:
-        joint = joint_covariance(cameras, by_lidars, found.poses)
+        joint = joint_covariance(cameras, by_lidars, found.poses.joint_covariance, found.poses.root)
     T, bars = found.poses.T_base_lidar, found.poses.covariance
     lidars = {
         name: Lidar(T_base_lidar=T[name], covariance=bars[name]) if name in bars else Lidar()

@@ -58,6 +58,7 @@ from calibgraph.trust.lens_checks import intrinsics_checks
 from calibgraph.trust.matcher_checks import last_round_checks, matcher_checks
 from calibgraph.trust.solution_checks import estimate_checks, outlier_frame_checks
 from calibgraph.trust.thresholds import threshold
+from calibgraph.vehicle.joined import joint_covariance
 
 _log = logging.getLogger(__name__)
 
@@ -204,7 +205,7 @@ def _judge_lidar(
         if not lidars.T_lidar_base:
             return None
         deviations.append(lidars.deviation)
-        joint = lidars.joint_with(joint, by_lidars)
+        joint = joint_covariance(joint, -by_lidars, lidars.covariance, lidars.by_errors)
         poses += lidars.T_lidar_base
         audits |= lidars.audits
     return find_lidar_motion(

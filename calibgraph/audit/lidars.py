@@ -54,18 +54,6 @@ class MeasuredLidars:
     T_lidar_base: list[Array]
     by_errors: Array = field(default_factory=lambda: np.empty((0, 0)))
 
-    def joint_with(self, cameras: Array, by_lidars: Array) -> Array:
-        """Covariance of the deviations of cameras and LiDARs.
-
-        Args:
-            cameras: (6 N, 6 N) of xi, with T_camera_lidar = exp(xi) estimate.
-            by_lidars: (6 N, 6 k) of it by the same errors, or (6 N, 0).
-        """
-        across = np.zeros((len(cameras), len(self.covariance)))
-        if by_lidars.size:
-            across = -by_lidars @ self.by_errors.T  # a deviation errs by -xi
-        return np.block([[cameras, across], [across.T, self.covariance]])
-
 
 def measure_lidars(
     deployed: Rig, data: Dataset, config: Config, tolerance: Array, *,

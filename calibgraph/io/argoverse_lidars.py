@@ -72,22 +72,18 @@ def _points(column: Callable[[str], NDArray[Any]]) -> Array:
 @lru_cache
 def _lower_half(log: Path) -> str:
     """The LiDAR of lasers 0 to 31."""
-    sweep = min((log / SWEEPS).glob("*.feather"))
+    sweep, scatters = min((log / SWEEPS).glob("*.feather")), {}
     column = read_feather(sweep)[1]
     points, lasers = _points(column), column("laser_number").astype(np.int64)
-    is_lower = lasers < _HALF
-    if is_lower.all() or not is_lower.any() or not 0 <= lasers.min() <= lasers.max() < 2 * _HALF:
+    halves = lasers < _HALF, (lasers >= _HALF) & (lasers < 2 * _HALF)
+    if not all(half.any() for half in halves) or not np.logical_or(*halves).all():
         raise FileError(sweep, f"has lasers {lasers.min()} to {lasers.max()}, expected 0 to 63 of "
                         f"two LiDARs; calibrate {log} as one cloud")  # fmt: skip
-    scatters = {
-        names[0]: sum(
-            _scatter_deg(
-                move_points(points[own], invert(T_egovehicle_sensor(log, name))), lasers[own]
-            )
-            for name, own in zip(names, (is_lower, ~is_lower), strict=True)
-        )
-        for names in (UP_AND_DOWN, UP_AND_DOWN[::-1])
-    }
+    for names in (UP_AND_DOWN, UP_AND_DOWN[::-1]):
+        own = [invert(T_egovehicle_sensor(log, name)) for name in names]
+        parts = [move_points(points[half], T) for half, T in zip(halves, own, strict=True)]
+        each = [_scatter_deg(of, lasers[half]) for half, of in zip(halves, parts, strict=True)]
+        scatters[names[0]] = sum(each)
     name = min(scatters, key=scatters.__getitem__)
     if max(scatters.values()) < _CLEARLY * scatters[name]:
         raise FileError(sweep, "its lasers do not tell its two LiDARs apart: elevations of one "

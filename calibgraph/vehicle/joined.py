@@ -213,15 +213,14 @@ def _cells(camera: Camera, cloud: Cloud) -> int:
     return len(np.unique(cells[inside], axis=0))
 
 
-def joint_covariance(cameras: Array, by_lidars: Array, poses: LidarPoses) -> Array:
-    """(6 N + 6 k) of cameras and LiDARs, with rotations and positions of these, in the base.
+def joint_covariance(cameras: Array, by_lidars: Array, lidars: Array, root: Array) -> Array:
+    """(6 N + 6 k) of cameras and LiDARs.
 
     Args:
         cameras: (6 N, 6 N) with the part by the poses of LiDARs.
-        by_lidars: (6 N, 6 k) by a standard deviation of each of these, or (6 N, 0).
-        poses: of the LiDARs.
+        by_lidars: (6 N, 6 k) by a standard deviation of each error of these, or (6 N, 0).
+        lidars: (6 k, 6 k) of them.
+        root: (6 k, 6 k) by a standard deviation of each of the errors.
     """
-    across = np.zeros((len(cameras), len(poses.joint_covariance)))
-    if by_lidars.size:
-        across = by_lidars @ poses.root.T
-    return np.block([[cameras, across], [across.T, poses.joint_covariance]])
+    across = by_lidars @ root.T if by_lidars.size else np.zeros((len(cameras), len(lidars)))
+    return np.block([[cameras, across], [across.T, lidars]])

@@ -149,7 +149,9 @@ def _placements(
         elif np.isinf(score[heading, i, j]):
             break
         refined = _refined(known, own, start, T_up_base[2, :3])
-        found += [each for each in refined if guess is None or _is_near(each.T, guess)]
+        found += [
+            each for each in refined if guess is None or _is_near(each.T, guess, _NEAR_DEG, _NEAR_M)
+        ]
         for T in (start, *(each.T for each in refined)):
             angles, shifted = away(T)
             score[(angles <= _PEAK_DEG)[:, None, None] & (shifted <= _PEAK_M)] = -np.inf
@@ -214,9 +216,11 @@ def _best(tried: Sequence[_Placement], guess: Array | None) -> tuple[_Placement,
     """
     best = max(tried, key=lambda each: each.score, default=_Placement(0, 0.0, np.eye(4)))
     as_good = [each for each in tried if each.score >= _AS_GOOD * best.score]
-    if guess is not None and any(_is_other(each.T, best.T) for each in as_good):
+    if guess is not None and any(
+        not _is_near(each.T, best.T, _OTHER_DEG, _OTHER_M) for each in as_good
+    ):
         best = min(as_good, key=lambda each: np.linalg.norm(each.T[:3, 3] - guess[:3, 3]))
-    others = [each for each in as_good if _is_other(each.T, best.T)]
+    others = [each for each in as_good if not _is_near(each.T, best.T, _OTHER_DEG, _OTHER_M)]
     if not others:
         return best, ""
     degrees, metres = max(_apart(each.T, best.T) for each in others)
@@ -229,11 +233,5 @@ def _apart(T_base_lidar: Array, other: Array) -> tuple[float, float]:
     return degrees, float(np.linalg.norm(T_base_lidar[:3, 3] - other[:3, 3]))
 
 
-def _is_other(T_base_lidar: Array, other: Array) -> bool:
-    degrees, metres = _apart(T_base_lidar, other)
-    return degrees > _OTHER_DEG or metres > _OTHER_M
-
-
-def _is_near(T_base_lidar: Array, guess: Array) -> bool:
-    degrees, metres = _apart(T_base_lidar, guess)
-    return degrees <= _NEAR_DEG and metres <= _NEAR_M
+def _is_near(T_base_lidar: Array, other: Array, deg: float, metres: float) -> bool:
+    return bool((np.array(_apart(T_base_lidar, other)) <= (deg, metres)).all())

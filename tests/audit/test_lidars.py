@@ -20,6 +20,7 @@ from calibgraph.model.geometry import invert, transform, twist_between
 from calibgraph.model.rig import Lidar, Rig
 from calibgraph.model.verdict import TOLERANCE
 from calibgraph.progress import no_progress
+from calibgraph.vehicle.joined import joint_covariance
 from calibgraph.vehicle.lidars import LidarPoses
 from calibgraph.vehicle.rig import judge_lidar
 from tests.conftest import Call
@@ -108,7 +109,8 @@ def test_deviations_of_cameras_and_lidars_have_one_covariance(monkeypatch):
             truth = transform(turned, T[:3, 3] + error[3:])
             own.append(twist_between(invert(truth), invert(T)))
         columns.append(np.concatenate([column, *own]))  # T_camera_lidar = exp(xi) estimate
-    joint = found.joint_with(by_lidars @ by_lidars.T, by_lidars)
+    of_cameras = by_lidars @ by_lidars.T
+    joint = joint_covariance(of_cameras, -by_lidars, found.covariance, found.by_errors)
     expected = np.transpose(columns) @ columns
     sigmas = np.sqrt(np.diag(expected))
     # of turns of 0.02 deg, second orders are 3e-4

@@ -144,14 +144,15 @@ def test_errors_of_cameras_are_those_of_solving_with_a_wrong_lidar(
 def test_cameras_and_lidars_have_one_covariance(drawn: tuple[Rig, Correspondences, Dataset]):
     rig, table, data = drawn
     poses = poses_of(T_TOP_LOW)
+    of_lidars = poses.joint_covariance, poses.root
     columns = np.concatenate([*errors_by_lidars(table, with_errors(data), rig).values()])
-    joint = joint_covariance(columns @ columns.T + 1e-12 * np.eye(12), columns, poses)
+    joint = joint_covariance(columns @ columns.T + 1e-12 * np.eye(12), columns, *of_lidars)
     assert joint.shape == (18, 18)
     sigmas = np.sqrt(np.diag(joint))
     assert np.linalg.eigvalsh(joint / np.outer(sigmas, sigmas)).min() > -1e-9
     # With all its points of one LiDAR, a camera errs by nothing but that LiDAR's pose.
     np.testing.assert_allclose(joint[6:12, 12:] / SIGMAS, columns[6:], rtol=1e-6, atol=1e-12)
-    alone = joint_covariance(np.eye(12), np.zeros((12, 0)), poses)
+    alone = joint_covariance(np.eye(12), np.zeros((12, 0)), *of_lidars)
     np.testing.assert_array_equal(alone[:12, 12:], 0.0)
 
 
