@@ -277,7 +277,11 @@ def test_cameras_that_the_base_does_not_show_are_calibrated_to_all_lidars(
     again = calibgraph.load_calibration(path)
     assert frame_of_entry(again.frames[0]).joined.keys() == {"low"}
     audit = calibgraph.check(path, tmp_path)
-    assert {of.status for of in (*audit.cameras.values(), *audit.lidars.values())} == {"OK"}
+    assert {of.status for of in audit.cameras.values()} == {"OK"}
+    low = audit.lidars["low"]
+    assert np.abs(low.deviation / low.sigma).max() < 4
+    # placed by one camera its bar is wider than the tolerance
+    assert low.status == ("OK" if from_deg < upto_deg else "CANNOT TELL")
     if from_deg < upto_deg:
         code, _, err = call("match", tmp_path, "--out", tmp_path / "table.parquet")
         table = calibgraph.load_correspondences(tmp_path / "table.parquet")
