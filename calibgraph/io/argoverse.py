@@ -10,10 +10,16 @@ from typing import Any
 
 import numpy as np
 
-from calibgraph.arrays import Array
 from calibgraph.errors import DatasetError, FileError
 from calibgraph.files import checked_model
-from calibgraph.io.argoverse_lidars import POSES, SWEEPS, UP_AND_DOWN, T_egovehicle_sensor, row
+from calibgraph.io.argoverse_lidars import (
+    POSES,
+    SWEEPS,
+    UP_AND_DOWN,
+    VEHICLE,
+    T_egovehicle_sensor,
+    row,
+)
 from calibgraph.io.frame import Frame
 from calibgraph.io.frame_files import files_by_stem
 from calibgraph.io.images import IMAGE_SUFFIXES
@@ -34,7 +40,7 @@ def argoverse(path: Path) -> PublishedFolder | None:
 
     None if a path is neither.
     """
-    log, base = (path.parent, path.name) if path.name in UP_AND_DOWN else (path, "")
+    log, base = (path.parent, path.name) if path.name in UP_AND_DOWN else (path, VEHICLE)
     if not ((log / POSES).is_file() and (log / SWEEPS).is_dir()):
         return None
 
@@ -51,17 +57,17 @@ def argoverse(path: Path) -> PublishedFolder | None:
 
 def _lidars(log: Path, base: str) -> Mapping[str, Any]:
     """What a rig has of LiDARs."""
-    if not base:
-        return {"lidar": "egovehicle"}
-    T_base_egovehicle = invert(_T_egovehicle(log, base))
-    poses = {name: T_base_egovehicle @ _T_egovehicle(log, name) for name in UP_AND_DOWN}
-    lidars = {name: {} if name == base else {"T_base_lidar": T} for name, T in poses.items()}
-    return {"lidar": base, "lidars": lidars}
+    T_base_egovehicle = invert(T_egovehicle_sensor(log, base))
+    lidars: dict[str, Any] = {base: {}} | {
+        name: {"T_base_lidar": T_base_egovehicle @ T_egovehicle_sensor(log, name)}
+        for name in _beside(base)
+    }
+    return {"lidar": base, "lidars": lidars if len(lidars) > 1 else None}
 
 
-def _T_egovehicle(log: Path, base: str) -> Array:
-    """(4, 4) of the frame of clouds."""
-    return T_egovehicle_sensor(log, base) if base else np.eye(4)
+def _beside(base: str) -> list[str]:
+    """The other LiDARs."""
+    return [name for name in UP_AND_DOWN if base not in (VEHICLE, name)]
 
 
 def _camera(log: Path, base: str, name: str) -> Camera:
@@ -70,7 +76,7 @@ def _camera(log: Path, base: str, name: str) -> Camera:
     content = {
         **{column: lens[column] for column in _SIZE},
         "intrinsics_px": {column[:2]: lens[column] for column in _LENS},
-        "T_camera_lidar": invert(T_egovehicle_camera) @ _T_egovehicle(log, base),
+        "T_camera_lidar": invert(T_egovehicle_camera) @ T_egovehicle_sensor(log, base),
     }
     return checked_model(Camera, content, f"{log / _LENSES}: {name}")
 
@@ -88,9 +94,9 @@ def _frames(log: Path, base: str, cameras: Sequence[str]) -> list[Frame]:
         Frame(
             i,
             str(stamp),
-            cloud.with_suffix(f".{base}") if base else cloud,
+            cloud if base == VEHICLE else cloud.with_suffix(f".{base}"),
             {n: images[n][int(nearest[n][i])] for n in cameras},
-            lidar_paths={n: cloud.with_suffix(f".{n}") for n in UP_AND_DOWN if base not in ("", n)},
+            lidar_paths={n: cloud.with_suffix(f".{n}") for n in _beside(base)},
         )
         for i, (stamp, cloud) in enumerate(sweeps.items())
         if all(abs(nearest[n][i] - stamp) <= _APART_NS for n in cameras)

@@ -18,7 +18,7 @@ from calibgraph.io.rig_parts import IncompleteCamera, pose_of_quaternion
 from calibgraph.io.tables import read_feather
 from calibgraph.model.geometry import invert, move_points
 
-UP_AND_DOWN = "up_lidar", "down_lidar"
+VEHICLE, UP_AND_DOWN = "egovehicle", ("up_lidar", "down_lidar")
 SWEEPS, POSES = Path("sensors/lidar"), Path("calibration/egovehicle_SE3_sensor.feather")
 SUFFIXES = tuple(f".{name}" for name in UP_AND_DOWN)
 _QUATERNION, _PLACE = ("qx", "qy", "qz", "qw"), ("tx_m", "ty_m", "tz_m")
@@ -46,7 +46,9 @@ def read_lidar(cloud: Path) -> tuple[list[str], Callable[[str], NDArray[Any]]]:
 
 
 def T_egovehicle_sensor(log: Path, name: str) -> Array:
-    """(4, 4) as the log states it."""
+    """(4, 4) as the log states it; of the vehicle itself the identity."""
+    if name == VEHICLE:
+        return np.eye(4)
     pose = row(log / POSES, name, (*_QUATERNION, *_PLACE))
     xyz_m, xyzw = ([pose[key] for key in keys] for keys in (_PLACE, _QUATERNION))
     try:
