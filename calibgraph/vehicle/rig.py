@@ -138,12 +138,11 @@ def calibrate_rig_lidars(
         seen = f"placed by cameras that see what it and {rig.lidar} see"
         warnings.append(f"{', '.join(placed)}: {seen}")
     poses = join_poses(parts, [rig.lidar, *guess])
-    clouds = _at_stamps(instants, poses.T_base_lidar)
     vehicle = None
     if rig.vehicle is not None:
         progress("finding the vehicle's frame", 0, 1)
         travel = Travel() if path is None else direction_of_travel(read_poses(path)[0])
-        vehicle, unknown = find_vehicle(rig.vehicle, _road(clouds, poses), travel)
+        vehicle, unknown = find_vehicle(rig.vehicle, _road(instants, poses.T_base_lidar), travel)
         warnings += unknown
     for line in warnings:
         _log.warning(line)
@@ -172,10 +171,9 @@ def _placed(
     return found
 
 
-def _look(
-    instants: Sequence[Instant], T_base_lidar: Mapping[str, Array | None], base: str
-) -> Views:
-    return look(_at_stamps(instants, {base: np.eye(4), **T_base_lidar}))
+def _look(instants: Sequence[Instant], guess: Mapping[str, Array | None], base: str) -> Views:
+    T_base_lidar = {base: np.eye(4), **guess}
+    return look({n: [each.at_stamp(n, T) for each in instants] for n, T in T_base_lidar.items()})
 
 
 def _solve(
@@ -242,22 +240,19 @@ def _turn_by_motion(
         return None
     ups = [
         find_upright("base", [view.points_m for view in maps])[2, :3],
-        find_upright(lidar, [of.clouds[lidar] for of in instants])[2, :3],
+        find_upright(lidar, [of.returns[lidar][0] for of in instants])[2, :3],
     ]
     speed_m_s = np.linalg.norm(both[:, 0], axis=1).max()
     pairs = np.concatenate([both, np.tile(speed_m_s * np.array(ups), (len(both), 1, 1))])
     return transform(Rotation.align_vectors(pairs[:, 0], pairs[:, 1])[0].as_matrix())
 
 
-def _road(clouds: Mapping[str, Sequence[Array]], poses: LidarPoses) -> Road | None:
+def _road(instants: Sequence[Instant], T_base_lidar: Mapping[str, Array]) -> Road | None:
     """The road by the clouds of all LiDARs together; None if they show none."""
     joined = [
-        np.concatenate([
-            move_points(cloud, T)
-            for cloud, T in zip(at, poses.T_base_lidar.values(), strict=True)
-        ])
-        for at in zip(*(clouds[name] for name in poses.T_base_lidar), strict=True)
-    ]  # fmt: skip
+        np.concatenate([move_points(each.at_stamp(n, T), T) for n, T in T_base_lidar.items()])
+        for each in instants
+    ]
     try:
         return find_road(joined)
     except CalibrationError:  # the axes are named as unknown
@@ -280,12 +275,6 @@ def _usable(instants: Sequence[Instant]) -> tuple[list[Instant], list[str]]:
         lines.append(f"in {moving} of {len(usable)} instants the vehicle moves: their clouds are "
                      "brought to one time by the points' times")  # fmt: skip
     return usable, lines
-
-
-def _at_stamps(
-    instants: Sequence[Instant], T_base_lidar: Mapping[str, Array | None]
-) -> dict[str, list[Array]]:
-    return {name: [each.at_stamp(name, T) for each in instants] for name, T in T_base_lidar.items()}
 
 
 def _complete(frames: Sequence[Frame], rig: Rig) -> list[Frame]:
