@@ -78,9 +78,34 @@ class ChildProcess:
 
     def start(self) -> None:
         """Start the process unless it runs, and wait until it is ready."""
+        if self._process is not None and self._process.poll() is None and not self._is_closed:
+            return
+        self.stop()
         try:
-            self._start()
+            if self._is_closed:
+                raise OSError("closed")
+            ours, theirs = Pipe()
+            # It finds modules where this one does, not in the folder it is started in.
+            known = [os.environ.get("PYTHONPATH", ""), *sys.path]
+            process = subprocess.Popen(
+                [sys.executable, "-P", "-m", self._module, str(theirs.fileno()), *self._arguments],
+                stdin=subprocess.PIPE,  # it ends with this process
+                stdout=subprocess.DEVNULL,
+                pass_fds=[theirs.fileno()],
+                env={
+                    **os.environ,
+                    **_ONE_THREAD,
+                    "PYTHONPATH": os.pathsep.join(filter(None, known)),
+                },
+                start_new_session=True,  # Ctrl-C is for the command
+            )
+            theirs.close()
+            self._process, self._connection = process, ours
+            ours.recv()  # it is ready
+            if self._is_closed:
+                raise OSError("closed")
         except (OSError, EOFError) as error:
+            self.stop()
             raise ChildEndedError(f"no process can be started ({error})") from error
 
     def ask(self, request: Any, timeout_s: float, on_note: Note | None = None) -> Any:
@@ -91,7 +116,7 @@ class ChildProcess:
             ChildTimeoutError: if it takes longer.
         """
         process, connection = self._process, self._connection
-        if process is None or connection is None:
+        if process is None or connection is None:  # by another thread
             raise ChildEndedError("the process was ended")
         end = time.monotonic() + timeout_s
         try:
@@ -107,30 +132,6 @@ class ChildProcess:
             raise ChildEndedError(_how_it_ended(process.wait())) from None
         self.stop()
         raise ChildTimeoutError(f"took over {timeout_s:g} s")
-
-    def _start(self) -> None:
-        if self._is_closed:
-            raise OSError("closed")
-        if self._process is not None and self._connection is not None:
-            if self._process.poll() is None:
-                return
-            self.stop()
-        ours, theirs = Pipe()
-        # It finds modules where this one does, not in the folder it is started in.
-        folders = os.pathsep.join([os.environ.get("PYTHONPATH", ""), *sys.path]).strip(os.pathsep)
-        process = subprocess.Popen(
-            [sys.executable, "-P", "-m", self._module, str(theirs.fileno()), *self._arguments],
-            stdin=subprocess.PIPE,  # it ends with this process
-            stdout=subprocess.DEVNULL,
-            pass_fds=[theirs.fileno()],
-            env={**os.environ, **_ONE_THREAD, "PYTHONPATH": folders},
-            start_new_session=True,  # Ctrl-C is for the command
-        )
-        theirs.close()
-        self._process, self._connection = process, ours
-        ours.recv()  # it is ready
-        if self._is_closed:
-            raise OSError("closed")
 
     def stop(self) -> None:
         """End the process, when no other thread uses it; the next request starts another."""

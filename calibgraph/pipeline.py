@@ -22,6 +22,7 @@ from calibgraph.io.clouds import describe_thinned
 from calibgraph.io.dataset import Dataset, load_dataset
 from calibgraph.io.tables import load_correspondences
 from calibgraph.matching.named import find_matcher, is_table
+from calibgraph.matching.run import MatchingRun
 from calibgraph.model.calibration import Calibration, Later
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.clock import odd_motions, unused_times
@@ -84,41 +85,39 @@ def calibrate(
         CorrespondenceError: if a camera gets too few correspondences.
         ValueError: if the matcher is unknown.
     """
-    report, watch = progress or no_progress, Stopwatch()
+    config, report = config or Config(), progress or no_progress
     data = dataset if isinstance(dataset, Dataset) else load_dataset(dataset, rig)
-    rig, lidars = (rig if rig and data is dataset else data.rig), None
-    config, joined = config or Config(), ""
-    if rig.other_lidars:
-        has_clouds = bool(rig.cameras) and not is_table(matcher)
+    rig = rig if rig and data is dataset else data.rig
+    match = partial(
+        match_in_rounds, config=config, terms=terms, time_limit_s=time_limit_s, progress=report
+    )
+    if not rig.other_lidars:
+        return _finish(match(data, rig, matcher))[0]
+    watch, has_clouds, joined = Stopwatch(), bool(rig.cameras) and not is_table(matcher), ""
 
-        def alone(data: Dataset, rig: Rig) -> Calibration:
-            return calibrate(
-                data, rig, matcher, config, terms=terms, time_limit_s=time_limit_s,
-                progress=progress,
-            )  # fmt: skip
+    def alone(data: Dataset, rig: Rig) -> Calibration:
+        return _finish(match(data, rig, matcher))[0]
 
-        with watch("lidars"):
-            place = partial(place_by_cameras, alone, data, rig) if has_clouds else None
-            lidars = calibrate_rig_lidars(data, rig, config, place=place, progress=report)
-            if has_clouds:
-                data, joined = join_clouds(data, rig, lidars.poses, config.tolerance)
-        if joined:
-            _log.info(joined)
-            matcher = JoinedMatcher(find_matcher(matcher, seed=config.seed), lidars.poses)
-    if lidars is not None and not rig.cameras:
+    with watch("lidars"):
+        place = partial(place_by_cameras, alone, data, rig) if has_clouds else None
+        lidars = calibrate_rig_lidars(data, rig, config, place=place, progress=report)
+        if has_clouds:
+            data, joined = join_clouds(data, rig, lidars.poses, config.tolerance)
+    if joined:
+        _log.info(joined)
+        matcher = JoinedMatcher(find_matcher(matcher, seed=config.seed), lidars.poses)
+    if rig.cameras:
+        result, by_lidars = _finish(match(data, rig, matcher))
+    else:
         with watch("hash_inputs"):
-            hashes = hash_inputs(data)
-        result = replace(
-            _without_cameras(rig, config, terms),
-            inputs=hashes,
-            frames=tuple(frame.entry() for frame in data.frames),
-            timings_s=watch.seconds,
-        )
-        return _with_lidars(result, lidars, np.empty((0, 0)), "")
+            result, by_lidars = _without_cameras(data, rig, config, terms), np.empty((0, 0))
+    result = replace(result, timings_s={**watch.seconds, **result.timings_s})
+    return _with_lidars(result, lidars, by_lidars, joined)
+
+
+def _finish(run: MatchingRun) -> tuple[Calibration, Array]:
+    """The calibration of a run's cameras, and :attr:`Solution.by_lidars` of it."""
     with Threads(1) as beside:
-        run = match_in_rounds(                                   # match -> solve_joint, in rounds
-            data, rig, matcher, config, terms=terms, time_limit_s=time_limit_s, progress=report
-        )  # fmt: skip
         if asks_offset(run):
             beside.submit(registered_twists, run.dataset)  # which its checks wait for
         run = refine_with_camera_pairs(run)  # what cameras see in common
@@ -131,7 +130,7 @@ def calibrate(
             record = to_metadata(evidence, checks)
     for line in thinned:
         _log.warning(line)
-    report("done", 1, 1)
+    run.progress("done", 1, 1)
     table = run.correspondences
     result = replace(
         to_calibration(evidence, checks),
@@ -140,18 +139,17 @@ def calibrate(
         rounds=run.rounds,
         warnings=(*run.warnings, *thinned),
         inputs=dict(run.hashes),
-        timings_s={**watch.seconds, **run.watch.seconds},
+        timings_s=run.watch.seconds,
     )
-    return (
-        result if lidars is None else _with_lidars(result, lidars, run.solution.by_lidars, joined)
-    )
+    return result, run.solution.by_lidars
 
 
-def _without_cameras(rig: Rig, config: Config, terms: Terms) -> Calibration:
+def _without_cameras(data: Dataset, rig: Rig, config: Config, terms: Terms) -> Calibration:
     """The result of a rig without cameras, before its LiDARs."""
     return Calibration(
         rig=rig, initial_rig=rig, covariance={}, joint_covariance=np.empty((0, 0)),
         camera_verdicts={}, residuals={}, counts={}, timings_s={}, terms=terms, config=config,
+        inputs=hash_inputs(data), frames=tuple(frame.entry() for frame in data.frames),
     )  # fmt: skip
 
 

@@ -12,13 +12,14 @@ from typer import Argument, Option
 
 from calibgraph.cli import options
 from calibgraph.cli.options import (
-    bag_options_from,
+    bag_settings,
     checked_arguments,
     dataset_from,
     matcher_from,
     time_limit_of,
 )  # fmt: skip
-from calibgraph.cli.terminal import elapsed_s, print_json, print_line, progress_bar, terminal
+from calibgraph.cli.terminal import elapsed_s, print_line, progress_bar, terminal
+from calibgraph.stdout import print_json, require_stdout
 
 if TYPE_CHECKING:
     from calibgraph.io.dataset import Dataset
@@ -63,7 +64,7 @@ def calibrate(
             matcher, weights, seed=settings.seed, all_frames=bool(frames or every_s),
             of_cmrnext=rare.of_cmrnext, search_deg=search_deg, search_m=search_m
         )  # fmt: skip
-    bag = bag_options_from(topic, every_s=every_s, motion=motion, **rare.of_bags)
+    bag = bag_settings(config, topic, every_s=every_s, motion=motion)
     data = dataset_from(dataset, rig, frames, bag, interval_s=interval_s)
     with progress_bar() as progress:
         result = calibrate(
@@ -71,7 +72,7 @@ def calibrate(
             time_limit_s=time_limit_of(matcher, time_limit_s), progress=progress
         )  # fmt: skip
         result = _warned_of_same_data(result, rig)
-        written = write_result(result, out, data)
+        written = write_result(result, out)
     checks = (check for of in result.camera_verdicts.values() for check in of.checks)
     copies = next((check.value for check in checks if check.name == "copies"), None)
     _print_frames_used(len(result.frames), data, int(copies or 0))
@@ -111,7 +112,7 @@ def match(
             matcher, weights, seed=settings.seed, all_frames=bool(frames or every_s),
             of_cmrnext=rare.of_cmrnext, search_deg=search_deg, search_m=search_m
         )  # fmt: skip
-    bag = bag_options_from(topic, every_s=every_s, motion=motion, **rare.of_bags)
+    bag = bag_settings(config, topic, every_s=every_s, motion=motion)
     data = dataset_from(dataset, rig, frames, bag, interval_s=interval_s)
     limit_s = time_limit_of(matcher, time_limit_s)
     with progress_bar() as progress:
@@ -149,7 +150,7 @@ def solve(
     ),
     common_cm: float | None = Option(None, metavar="CM", min=0, help="Likewise, of the position."),
     print_graph: bool = Option(
-        False, "--print-graph", callback=options.require_stdout, help="Print every factor."
+        False, "--print-graph", callback=require_stdout, help="Print every factor."
     ),
     config: options.ConfigFile = None,
     as_json: options.JsonOption = False,

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from typer import Argument, Option
 
 from calibgraph.cli.terminal import print_line, progress_bar
+from calibgraph.stdout import require_stdout
 
 if TYPE_CHECKING:
     from calibgraph.io.bags import BagOptions
@@ -52,29 +53,22 @@ def dataset_from(
     return data
 
 
-def bag_options_from(topic: list[str] | None, **options: Any) -> BagOptions | None:
-    """How bags are read; None if no option is given.
+def bag_settings(config: Path | None, topic: list[str] | None, **options: Any) -> BagOptions | None:
+    """How bags are read, by a file of settings and options; None if neither has anything of it.
 
     Raises:
         CalibrationError: if a value is out of range, or a topic has no name.
     """
+    from calibgraph.cli.settings import read_settings
     from calibgraph.io.bags import BagOptions
 
-    given = {name: value for name, value in options.items() if value is not None}
-    if not topic and not given:
-        return None
     with checked_arguments():
+        options |= read_settings(config)[1].of_bags
+        given = {name: value for name, value in options.items() if value is not None}
+        if not topic and not given:
+            return None
         topics = parse_names("--topic", topic, "NAME=/TOPIC, as lidar=/velodyne_points")
         return BagOptions(topics=topics, **given)
-
-
-def bag_settings(config: Path | None, topic: list[str] | None, **options: Any) -> BagOptions | None:
-    """See :func:`bag_options_from`; a file of settings has some of them."""
-    from calibgraph.cli.settings import read_settings
-
-    with checked_arguments():
-        _, rare = read_settings(config)
-    return bag_options_from(topic, **options, **rare.of_bags)
 
 
 def matcher_from(
@@ -135,15 +129,6 @@ def parse_names(
 
 _BAGS, _STRUCTURE = "ROS bags", "Matcher structure"
 _MOST_SEED = 2**31 - 1
-
-
-def require_stdout(as_json: bool) -> bool:
-    """Refuse ``--json`` to a closed stdout before the work, not after it."""
-    if as_json:
-        from calibgraph.report.as_json import require_stdout
-
-        require_stdout()
-    return as_json
 
 
 Datasets = Annotated[

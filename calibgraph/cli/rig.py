@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Any
 from typer import Argument, Option
 
 from calibgraph.cli import options
-from calibgraph.cli.options import bag_options_from, checked_arguments, parse_names
-from calibgraph.cli.terminal import print_json, print_line, progress_bar
+from calibgraph.cli.options import bag_settings, checked_arguments, parse_names
+from calibgraph.cli.terminal import print_line, progress_bar
 from calibgraph.errors import CalibrationError
 from calibgraph.io.formats import IMPORT_FORMATS
+from calibgraph.stdout import print_json
 
 if TYPE_CHECKING:
     from calibgraph.guessing.guess import RigGuess
@@ -190,7 +191,7 @@ def _rig_of_bags(
     from calibgraph.io.bags.rig import doubtful_axes, read_bag_rig
 
     topics = sorted(Bag(paths[0]).topics.values(), key=lambda each: each.name)
-    read = read_bag_rig(paths[0], bag_options_from(topic, beside=tuple(paths[1:]) or None))
+    read = read_bag_rig(paths[0], bag_settings(None, topic, beside=tuple(paths[1:]) or None))
     made = read.to_rig()
     listed = [{"topic": each.name, "type": each.type, "messages": each.count} for each in topics]
     return made, [*doubtful_axes(made), *read.notes], listed

@@ -17,8 +17,9 @@ from typer import Argument, Option
 
 from calibgraph.cli import options
 from calibgraph.cli.options import JsonOption, bag_settings, dataset_from
-from calibgraph.cli.terminal import print_json, print_line, progress_bar
+from calibgraph.cli.terminal import print_line, progress_bar
 from calibgraph.errors import CalibrationError, FileError, needs_extra
+from calibgraph.stdout import print_json
 
 if TYPE_CHECKING:
     from calibgraph.fleet.page import FleetReport
@@ -183,7 +184,6 @@ def fleet(
     What is finished is not done again: after Ctrl-C, a crash or a lost machine the same command
     goes on. Exit 1 if a job failed or a camera's verdict is FAIL.
     """
-    from calibgraph.errors import CalibrationError
     from calibgraph.fleet.job import Limits
     from calibgraph.fleet.page import write_fleet_report
     from calibgraph.fleet.run import dask_executor, run_fleet, thread_executor

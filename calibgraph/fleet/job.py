@@ -29,6 +29,7 @@ from calibgraph.errors import CalibrationError
 from calibgraph.fleet.files import fetch
 from calibgraph.fleet.manifest import Job
 from calibgraph.model.calibration import version_of
+from calibgraph.report.as_json import verdict_summary
 
 _LOG, _MOST_LOG = "log.txt", 2**16
 _kept = threading.local()
@@ -118,27 +119,20 @@ def main() -> None:
 def execute(job: Job, limits: Limits, folder: Path) -> Outcome:
     """Run a job here; what is wrong with its data or its machine is part of the outcome."""
     places = dict[str, str]()
+
+    def local(uri: str) -> Path:
+        """Noted for messages."""
+        path = fetch(uri, folder / str(len(places)), limits.fetch_bytes)
+        places[str(path)] = uri
+        return path
+
     try:
-        return Outcome(_calibrate(job, limits, lambda uri: _local(uri, limits, folder, places)))
+        return Outcome(_calibrate(job, limits, local))
     except Exception as error:
         kind, text = describe_failure(error)
     for place, uri in places.items():
         text = text.replace(place, uri)
     return Outcome(error_kind=kind, error=str(CalibrationError(text)))  # in one line
-
-
-def _local(uri: str, limits: Limits, folder: Path, places: dict[str, str]) -> Path:
-    """The local path of a URI, noted in ``places`` for messages."""
-    target = folder / str(len(places))
-    target.mkdir()
-    try:
-        path = fetch(uri, target, limits.fetch_bytes)
-    except CalibrationError:
-        raise
-    except Exception as error:  # of any store's client: the next time it may work
-        raise OSError(f"{uri}: cannot be fetched ({error})") from error
-    places[str(path)] = uri
-    return path
 
 
 def _calibrate(
@@ -172,11 +166,9 @@ def _calibrate(
 def _cells(result: Any) -> tuple[dict[str, Any], ...]:
     rows = []
     for camera, verdict in result.camera_verdicts.items():
-        doubt, covariance = verdict.error_probability, result.covariance[camera]
-        summary = result.summary_of(camera)
+        covariance, summary = result.covariance[camera], result.summary_of(camera)
         rows.append({
-            "camera": camera, "verdict": verdict.status, "cannot_tell": verdict.cannot_tell,
-            "probability_off": None if doubt is None else doubt.probability,
+            "camera": camera, **verdict_summary(verdict),
             "reasons": [reason.text for reason in summary.reasons],
             "actions": [*summary.actions], "of": result.config.of,
             "T_camera_lidar": result.T_camera_lidar[camera].ravel().tolist(),

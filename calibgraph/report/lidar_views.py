@@ -13,7 +13,7 @@ from calibgraph.io.frame import frame_of_entry
 from calibgraph.matching.cloud_similarity import find_upright
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.geometry import move_points
-from calibgraph.report.plots import png_uri
+from calibgraph.report.kit import data_uri, encode
 
 # RGB colours that the colour-blind can tell apart (Okabe and Ito), the base first; then again.
 _COLOURS = ("#000000", "#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
@@ -88,4 +88,4 @@ def _picture(
         inside = (column >= 0) & (column < size[0]) & (row >= 0) & (row < size[1])
         blue, green, red = (int(colours[name][k : k + 2], 16) for k in (5, 3, 1))
         image[size[1] - 1 - row[inside], column[inside]] = blue, green, red
-    return png_uri(image)
+    return data_uri(encode(image, "png"))

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import base64
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import cv2
@@ -15,8 +14,10 @@ from calibgraph.errors import CalibrationError
 from calibgraph.files import write_bytes
 from calibgraph.io.frame import Frame
 from calibgraph.model.clock import when_taken
-from calibgraph.model.rig import Camera, Rig
+from calibgraph.model.geometry import move_points
+from calibgraph.model.rig import Camera
 from calibgraph.model.verdict import Status
+from calibgraph.report.kit import data_uri, encode
 
 _PICTURES_BYTES = 3_000_000  # of all pictures together; base64 adds a third
 _SIZES = ((1100, 80), (1100, 70), (960, 65), (800, 60), (640, 60), (480, 50), (320, 40))
@@ -35,17 +36,23 @@ def draw_overlays(
     drawn = dict[str, tuple[str, ...]]()
     budget = _PICTURES_BYTES // (2 * max(len(cameras), 1))
     try:
-        cloud = frame.load_cloud()[:, :3].astype(np.float64)
-        for name, several in cameras.items():
-            if name in frame.image_paths:
-                seen = [when_taken(camera, frame.twist_per_s) for camera in several]
-                image = frame.load_image(name, several[0])
-                drawn[name] = tuple(
-                    _to_jpeg(draw_points(image, cloud, camera), budget) for camera in seen
-                )
+        for name, pictures in _draw(frame, cameras):
+            drawn[name] = tuple(_to_jpeg(picture, budget) for picture in pictures)
     except (CalibrationError, OSError) as error:
         return drawn, str(error)
     return drawn, None
+
+
+def _draw(
+    frame: Frame, cameras: Mapping[str, Sequence[Camera]]
+) -> Iterator[tuple[str, list[Image]]]:
+    """The cloud on each camera's image, (height, width, 3) BGR, once for each of its extrinsics."""
+    cloud = frame.load_cloud()[:, :3].astype(np.float64)
+    for name, several in cameras.items():
+        if name in frame.image_paths:
+            image = frame.load_image(name, several[0])
+            seen = (when_taken(camera, frame.twist_per_s) for camera in several)
+            yield name, [draw_points(image, cloud, camera) for camera in seen]
 
 
 def width_on_page(camera: Camera) -> int:
@@ -60,7 +67,7 @@ def depth_scale() -> tuple[str, list[tuple[float, str]]]:
         A gradient of CSS, and its ticks: percent from the left, label.
     """
     low, high = np.log(DEPTH_RANGE_M)
-    ticks = np.array([2, 5, 10, 20, 50])
+    ticks = np.array(_TICKS_M)
     at = 100 * (np.log(ticks) - low) / (high - low)
     stops = depth_colours(np.exp(np.linspace(low, high, _STOPS)))
     labels = [f"{ticks[0]} m", *map(str, ticks[1:])]
@@ -72,19 +79,15 @@ def _to_jpeg(image: NDArray[np.uint8], budget: int) -> str:
     """A data URI of the largest and best JPEG of at most ``budget`` bytes."""
     data = b""
     for width, quality in _SIZES:
-        small = shrink(image, width)
-        encoded, buffer = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, quality])
-        if not encoded:
-            raise CalibrationError(f"an image of shape {small.shape} cannot be encoded as JPEG")
-        data = buffer.tobytes()
+        data = encode(shrink(image, width), "jpeg", cv2.IMWRITE_JPEG_QUALITY, quality)
         if len(data) <= budget:
             break
-    return f"data:image/jpeg;base64,{base64.b64encode(data).decode('ascii')}"
+    return data_uri(data, "jpeg")
 
 
 Image = NDArray[np.uint8]
 
-DEPTH_RANGE_M = (2.0, 60.0)
+DEPTH_RANGE_M, _TICKS_M = (2.0, 60.0), (2, 5, 10, 20, 50)
 _MAX_WIDTH_PX = 1280  # of a file, so that those of many cameras stay small
 _BAR_PX = 34
 _COVERED_SHARE = 0.2  # of the image, covered by points
@@ -94,10 +97,8 @@ _MARKS: dict[Status, str] = {"PASS": "PASS", "WARN": "WARN", "FAIL": "FAIL, do n
 
 def write_overlays(
     frame: Frame,
-    guess: Rig,
+    cameras: Mapping[str, Sequence[Camera]],
     folder: Path,
-    *,
-    final: Rig | None = None,
     verdicts: Mapping[str, Status] | None = None,
 ) -> list[Path]:
     """Write a picture of every camera: the cloud on its image, by the guess, and by a result below.
@@ -107,23 +108,15 @@ def write_overlays(
     Raises:
         CalibrationError: if an image or the cloud cannot be read, or a picture not be written.
     """
-    cloud, paths = frame.load_cloud()[:, :3].astype(np.float64), list[Path]()
-    for name, camera in guess.cameras.items():
-        image = frame.load_image(name, camera)
-        shown = {f"{name}, frame {frame.name}: {'guess' if final is None else 'before'}": camera}
-        if final is not None and verdicts is not None:
-            shown[f"{name}, after: {_MARKS[verdicts[name]]}"] = final.cameras[name]
-        panels = [
-            _titled(draw_points(image, cloud, when_taken(each, frame.twist_per_s)), title)
-            for title, each in shown.items()
-        ]
-        picture = shrink(np.vstack([*panels, _depth_bar(image.shape[1])]), _MAX_WIDTH_PX)
-        encoded, data = cv2.imencode(".png", picture)
-        path = folder / f"{'guess' if final is None else 'overlay'}_{name}.png"
-        if not encoded:
-            raise CalibrationError(f"{path}: shape {picture.shape} cannot be encoded as PNG")
-        write_bytes(path, data.tobytes())
-        paths.append(path)
+    kind, first = ("guess", "guess") if verdicts is None else ("overlay", "before")
+    paths = []
+    for name, pictures in _draw(frame, cameras):
+        titles = [f"{name}, frame {frame.name}: {first}"]
+        titles += [] if verdicts is None else [f"{name}, after: {_MARKS[verdicts[name]]}"]
+        panels = map(_titled, pictures, titles)
+        picture = shrink(np.vstack([*panels, _depth_bar(pictures[0].shape[1])]), _MAX_WIDTH_PX)
+        paths.append(folder / f"{kind}_{name}.png")
+        write_bytes(paths[-1], encode(picture, "png"))
     return paths
 
 
@@ -135,28 +128,19 @@ def draw_points(image: Image, points_lidar_m: Array, camera: Camera) -> Image:
         points_lidar_m: (n, 3) in the LiDAR frame.
         camera: lens and extrinsic.
     """
-    points, pixels = visible_points(points_lidar_m, camera)
-    order = np.argsort(-np.linalg.norm(points, axis=1))
-    points, pixels = points[order], pixels[order]
-    column, row = np.rint(pixels).astype(np.intp).T
-    colours = depth_colours(np.linalg.norm(points, axis=1))
-    drawn = image.copy()
+    points = move_points(points_lidar_m, camera.T_camera_lidar)
+    pixels, valid = camera.lens.project(points)
+    seen, distance_m = valid & camera.in_image(pixels), np.linalg.norm(points, axis=1)
+    order = np.flatnonzero(seen)[np.argsort(-distance_m[seen])]
+    column, row = np.rint(pixels[order]).astype(np.intp).T
+    colours, drawn = depth_colours(distance_m[order]), image.copy()
     # Larger for few points, so that all cover a fixed share.
-    side = np.sqrt(_COVERED_SHARE * image.shape[0] * image.shape[1] / max(len(points), 1))
+    side = np.sqrt(_COVERED_SHARE * image.shape[0] * image.shape[1] / max(len(order), 1))
     side = int(np.clip(round(side), 1, _MAX_DOT_PX))
     for dy, dx in np.ndindex(side, side):
         rows = np.clip(row + dy - side // 2, 0, image.shape[0] - 1)
         drawn[rows, np.clip(column + dx - side // 2, 0, image.shape[1] - 1)] = colours
     return drawn
-
-
-def visible_points(points_lidar_m: Array, camera: Camera) -> tuple[Array, Array]:
-    """The points that a camera sees: (m, 3) in its frame, and (m, 2) their pixels."""
-    T = camera.T_camera_lidar
-    points = points_lidar_m @ T[:3, :3].T + T[:3, 3]
-    pixels, valid = camera.lens.project(points)
-    valid &= camera.in_image(pixels)
-    return points[valid], pixels[valid]
 
 
 def depth_colours(distance_m: Array) -> Image:
@@ -186,7 +170,7 @@ def _depth_bar(width: int) -> Image:
     low, high = np.log(DEPTH_RANGE_M)
     distances = np.exp(np.linspace(low, high, width))
     bar = np.repeat(depth_colours(distances)[None], round(_BAR_PX * scale), axis=0)
-    for tick in (2, 5, 10, 20, 50):
+    for tick in _TICKS_M:
         x = int((np.log(tick) - low) / (high - low) * (width - 1))
         for colour, thickness in (((0, 0, 0), 4), ((255, 255, 255), 1)):  # outlined
             cv2.putText(

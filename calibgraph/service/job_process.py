@@ -28,7 +28,7 @@ from calibgraph.model.calibration import Calibration
 from calibgraph.model.result_files import REPORT_FILE
 from calibgraph.pipeline import calibrate, solve
 from calibgraph.progress import Progress
-from calibgraph.report.as_json import finite, result_summary
+from calibgraph.report.as_json import result_summary
 from calibgraph.report.html import write_result
 from calibgraph.service.folders import (
     ARCHIVE,
@@ -49,6 +49,7 @@ from calibgraph.service.requests import (
     SolveSettings,
     recording_name,
 )
+from calibgraph.stdout import finite
 
 _NOTE_EVERY_S = 0.1
 
@@ -104,7 +105,7 @@ def _solve(task: JobTask, progress: Progress) -> Outcome:
     progress("solving", 0, 1)
     result = solve(load_rig(rig), table, settings.config, settings.terms)
     result = replace(result, inputs={str(table): sha256(table)})
-    return _write(task, result, None, with_report=settings.report)
+    return _write(task, result, with_report=settings.report)
 
 
 def _calibrate(task: JobTask, progress: Progress) -> Outcome:
@@ -128,11 +129,11 @@ def _calibrate(task: JobTask, progress: Progress) -> Outcome:
         progress=progress,
     )
     progress("writing", 0, 1)
-    return _write(task, result, data, with_report=settings.report)
+    return _write(task, result, with_report=settings.report)
 
 
-def _write(task: JobTask, result: Calibration, data: Any, *, with_report: bool) -> Outcome:
-    written = write_result(result, task.folder / WORK / FILES, data, with_report=with_report)
+def _write(task: JobTask, result: Calibration, *, with_report: bool) -> Outcome:
+    written = write_result(result, task.folder / WORK / FILES, with_report=with_report)
     _write_summary(task, result_summary(result, [Path(path.name) for path in written]))
     return Outcome((result.verdict.status, result.verdict.cannot_tell))
 

@@ -42,7 +42,7 @@ class JobList(BaseModel):
 
 
 def _answer(record: JobRecord, state: Service) -> JobRecord:
-    return record.model_copy(update={"progress": state.runner.steps.get(record.id)})
+    return record.model_copy(update={"progress": state.steps.get(record.id)})
 
 
 _FILE = {"type": "string", "format": "binary"}
@@ -103,7 +103,7 @@ async def get_job(
 def cancel_job(id: str, state: State) -> JobRecord:
     """Cancel a job that waits or runs."""
     _found(state, id)
-    if not state.runner.cancel(id):
+    if not state.cancel(id):
         raise Problem(409, "the job is finished")
     return _answer(_found(state, id), state)
 

@@ -16,7 +16,8 @@ from calibgraph.files import sync_to_disk, write_bytes, write_text
 from calibgraph.io.rigs import load_rig
 from calibgraph.io.tables import from_arrow
 from calibgraph.model.config import config_from
-from calibgraph.report.as_json import finite, result_summary
+from calibgraph.report.as_json import result_summary
+from calibgraph.stdout import finite
 from calibgraph.tracking import DurableCalibrator, warm_up_tracker
 from calibgraph.tracking.assessment import json_lines
 from calibgraph.tracking.frames import Item, frames_of_lines, frames_of_table
