@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing import Pipe
@@ -46,8 +46,20 @@ class Outcome:
     log: str = ""
 
 
-def describe_failure(error: Exception) -> tuple[ErrorKind, str]:
-    """The kind of a job's failure, and its text: wrong data are no fault of the machine's."""
+def failed(error: Exception, places: Mapping[str, str]) -> Outcome:
+    """The outcome of a job that failed: wrong data are no fault of the machine's.
+
+    Args:
+        error: of the job.
+        places: parts of its text that are of this machine, as paths, and what to read for them.
+    """
+    kind, text = _describe(error)
+    for place, name in places.items():
+        text = text.replace(place, name)
+    return Outcome(error_kind=kind, error=str(CalibrationError(text)))  # in one line
+
+
+def _describe(error: Exception) -> tuple[ErrorKind, str]:
     if isinstance(error, MemoryError):
         why = f" ({error})" if str(error) else ""
         return "out of memory", f"not enough memory{why}; give fewer frames, or more --memory-gb"

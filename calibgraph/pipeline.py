@@ -17,7 +17,6 @@ from pathlib import Path
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.elsewhere import go_on_elsewhere
 from calibgraph.io.clouds import describe_thinned
 from calibgraph.io.dataset import Dataset, load_dataset
 from calibgraph.io.tables import load_correspondences
@@ -32,7 +31,13 @@ from calibgraph.model.lens import with_sigmas
 from calibgraph.model.rig import Lidar, Rig
 from calibgraph.parallel import Threads, with_own_threads
 from calibgraph.progress import Progress, Stopwatch, no_progress
-from calibgraph.rounds import AnyMatcher, Datasets, match_in_rounds, refine_with_camera_pairs
+from calibgraph.rounds import (
+    AnyMatcher,
+    Datasets,
+    go_on_elsewhere,
+    match_in_rounds,
+    refine_with_camera_pairs,
+)
 from calibgraph.solver.joint import solve_joint
 from calibgraph.trust.assess import assess, assess_run, in_order
 from calibgraph.trust.evidence import Evidence

@@ -5,11 +5,11 @@ from __future__ import annotations
 import logging
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import typer
 from typer import Argument, Option
 
+import calibgraph
 from calibgraph.cli import options
 from calibgraph.cli.options import (
     bag_settings,
@@ -20,11 +20,6 @@ from calibgraph.cli.options import (
 )  # fmt: skip
 from calibgraph.cli.terminal import elapsed_s, print_line, progress_bar, terminal
 from calibgraph.stdout import print_json, require_stdout
-
-if TYPE_CHECKING:
-    from calibgraph.io.dataset import Dataset
-    from calibgraph.model.calibration import Calibration
-
 
 TABLE_SUFFIXES = (".parquet", ".csv")
 
@@ -55,7 +50,6 @@ def calibrate(
 
     keep_freed_memory()
     require_result_folder(out, [*dataset, *_rig_files(rig)])
-    from calibgraph.pipeline import calibrate
     from calibgraph.report.html import write_result
 
     with checked_arguments():
@@ -67,7 +61,7 @@ def calibrate(
     bag = bag_settings(config, topic, every_s=every_s, motion=motion)
     data = dataset_from(dataset, rig, frames, bag, interval_s=interval_s)
     with progress_bar() as progress:
-        result = calibrate(
+        result = calibgraph.calibrate(
             data, matcher=chosen, config=settings, terms=rare.terms,
             time_limit_s=time_limit_of(matcher, time_limit_s), progress=progress
         )  # fmt: skip
@@ -158,10 +152,7 @@ def solve(
     """Calibrate all cameras jointly from a table of correspondences, with a report."""
     from calibgraph.cli.settings import read_settings
     from calibgraph.files import sha256
-    from calibgraph.io.rigs import load_rig
-    from calibgraph.io.tables import load_camera_matches
     from calibgraph.model.result_files import require_result_folder
-    from calibgraph.pipeline import solve
     from calibgraph.report.html import write_result
 
     matches = [] if camera_matches is None else [camera_matches]
@@ -174,8 +165,10 @@ def solve(
         if print_graph and as_json:
             raise ValueError("--print-graph and --json both print; choose one")
     with progress_bar("solving"), checked_arguments():
-        seen = None if camera_matches is None else load_camera_matches(camera_matches)
-        result = solve(load_rig(rig), correspondences, settings, rare.terms, camera_matches=seen)
+        seen = None if camera_matches is None else calibgraph.load_camera_matches(camera_matches)
+        result = calibgraph.solve(
+            calibgraph.load_rig(rig), correspondences, settings, rare.terms, camera_matches=seen
+        )
         result = replace(result, inputs={str(correspondences): sha256(correspondences)})
         result = _warned_of_same_data(result, rig)
         written = write_result(result, out)
@@ -192,7 +185,9 @@ def _rig_files(rig: Path | None) -> list[Path]:
     return [] if rig is None else [find_rig_file(rig) or rig]
 
 
-def _warned_of_same_data(result: Calibration, rig: Path | None) -> Calibration:
+def _warned_of_same_data(
+    result: calibgraph.Calibration, rig: Path | None
+) -> calibgraph.Calibration:
     """With a warning if what was estimated has a prior that is from the same data."""
     from calibgraph.io.calibrations import stated_result
     from calibgraph.io.rigs import rig_file
@@ -208,7 +203,7 @@ def _warned_of_same_data(result: Calibration, rig: Path | None) -> Calibration:
     return replace(result, warnings=(*result.warnings, text))
 
 
-def _print_frames_used(used: int, data: Dataset, copies: int) -> None:
+def _print_frames_used(used: int, data: calibgraph.Dataset, copies: int) -> None:
     """Print how many frames were matched, unless all were."""
     text = f"{used} of {len(data.frames)} frames"
     if used + copies < len(data.frames):
@@ -219,7 +214,7 @@ def _print_frames_used(used: int, data: Dataset, copies: int) -> None:
         print_line(text)
 
 
-def _print_and_exit(result: Calibration, written: list[Path], *, as_json: bool) -> None:
+def _print_and_exit(result: calibgraph.Calibration, written: list[Path], *, as_json: bool) -> None:
     """Print a result; exit 1 if it is FAIL."""
     if as_json:
         from calibgraph.report.as_json import result_summary
@@ -261,7 +256,6 @@ def track(
     as wide. Tables of `calibgraph match` list them.
     """
     from calibgraph.cli.settings import read_settings
-    from calibgraph.io.rigs import load_rig
     from calibgraph.model.result_files import require_result_folder
     from calibgraph.tracking.command import track
     from calibgraph.tracking.state import require_poses_alone
@@ -270,6 +264,6 @@ def track(
     with checked_arguments():
         settings, _ = read_settings(config, seed=seed)
         require_poses_alone(settings)
-    guess = load_rig(rig)
+    guess = calibgraph.load_rig(rig)
     result, written = track(guess, source, config=settings, out=out, notify=print_line)
     _print_and_exit(result, written, as_json=False)

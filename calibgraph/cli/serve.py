@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import typer
 from typer import Argument, Option
 
+import calibgraph
 from calibgraph.cli import options
 from calibgraph.cli.options import JsonOption, bag_settings, dataset_from
 from calibgraph.cli.terminal import print_line, progress_bar
@@ -185,8 +186,7 @@ def fleet(
     goes on. Exit 1 if a job failed or a camera's verdict is FAIL.
     """
     from calibgraph.fleet.job import Limits
-    from calibgraph.fleet.page import write_fleet_report
-    from calibgraph.fleet.run import dask_executor, run_fleet, thread_executor
+    from calibgraph.fleet.run import dask_executor, thread_executor
 
     if dask is not None and jobs is not None:
         raise CalibrationError("--jobs is of this machine: with --dask the cluster's threads count")
@@ -194,8 +194,10 @@ def fleet(
     limits = Limits(timeout_s=timeout_s, memory_bytes=memory_bytes, fetch_bytes=fetch_gb * 1e9)
     opened = thread_executor(jobs) if dask is None else dask_executor(dask)
     with _interrupt_on_sigterm(), progress_bar() as progress, opened as executor:
-        summary = run_fleet(manifest, out, executor=executor, limits=limits, progress=progress)
-    report = write_fleet_report(out)
+        summary = calibgraph.run_fleet(
+            manifest, out, executor=executor, limits=limits, progress=progress
+        )
+    report = calibgraph.write_fleet_report(out)
     if as_json:
         print_json({"out": out, **asdict(summary), "moved_lidars": [*report.moved_lidars]})
     else:

@@ -21,7 +21,7 @@ from calibgraph.child_process import (
     ChildTimeoutError,
     Outcome,
     answer_requests,
-    describe_failure,
+    failed,
     memory_limit,
     output_to,
 )
@@ -129,10 +129,7 @@ def execute(job: Job, limits: Limits, folder: Path) -> Outcome:
     try:
         return Outcome(_calibrate(job, limits, local))
     except Exception as error:
-        kind, text = describe_failure(error)
-    for place, uri in places.items():
-        text = text.replace(place, uri)
-    return Outcome(error_kind=kind, error=str(CalibrationError(text)))  # in one line
+        return failed(error, places)
 
 
 def _calibrate(

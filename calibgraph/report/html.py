@@ -14,7 +14,7 @@ from calibgraph.files import write_text, written_together
 from calibgraph.io.formats import EXPORT_FORMATS
 from calibgraph.io.frame import Frame, frame_of_entry
 from calibgraph.model.calibration import FRAMES_SENTENCE, TANGENT_SENTENCE, Calibration
-from calibgraph.model.geometry import degrees_and_centimetres, invert
+from calibgraph.model.geometry import invert
 from calibgraph.model.metrics import pose_error
 from calibgraph.model.places import describe_places
 from calibgraph.model.result_files import (
@@ -110,7 +110,6 @@ def render_page(result: Calibration) -> str:
         matrix_text=matrix_text,
         pose_text=pose_text,
         invert=invert,
-        degrees_and_centimetres=degrees_and_centimetres,
         width_on_page=width_on_page,
         depth_scale=depth_scale(),
         shown=shown,

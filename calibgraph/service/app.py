@@ -76,7 +76,7 @@ def serve(app: FastAPI, host: str, port: int, announce: Callable[[str], None]) -
     """Serve an application until SIGTERM or Ctrl-C; announce the URL once it listens."""
     service: Service = app.state.service
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s")
-    tempfile.tempdir = str(service.folder.arriving)  # uploads arrive on the disk that has room
+    tempfile.tempdir = str(service.arriving)  # uploads arrive on the disk that has room
     try:
         listening = _listen(host, port)
         shown = f"[{host}]" if ":" in host else host

@@ -15,11 +15,11 @@ from calibgraph.child_process import (
     Note,
     Outcome,
     answer_requests,
-    describe_failure,
+    failed,
     memory_limit,
     output_to,
 )
-from calibgraph.errors import CalibrationError, FileError, in_words
+from calibgraph.errors import FileError, in_words
 from calibgraph.files import sha256, write_text
 from calibgraph.io.dataset import load_dataset
 from calibgraph.io.rigs import load_rig
@@ -30,18 +30,16 @@ from calibgraph.pipeline import calibrate, solve
 from calibgraph.progress import Progress
 from calibgraph.report.as_json import result_summary
 from calibgraph.report.html import write_result
-from calibgraph.service.folders import (
+from calibgraph.service.requests import (
     ARCHIVE,
     FILES,
     INPUT,
     LOG,
+    RIG,
     SCRATCH,
     SUMMARY,
-    WORK,
-)  # fmt: skip
-from calibgraph.service.requests import (
-    RIG,
     TABLE,
+    WORK,
     CalibrationSettings,
     CheckSettings,
     JobProgress,
@@ -68,11 +66,10 @@ def run_job(task: JobTask, note: Note) -> Outcome:
     try:
         return run(task, _progress(note))
     except Exception as error:
-        kind, text = describe_failure(error)
+        places = {f"{task.folder}/{SCRATCH}/": "", str(task.folder): ""}
         if isinstance(error, OSError):  # whose text may name the server's files
-            text = error.strerror or type(error).__name__
-    text = text.replace(f"{task.folder}/{SCRATCH}/", "").replace(str(task.folder), "")
-    return Outcome(error_kind=kind, error=str(CalibrationError(text)))
+            places = {str(error): error.strerror or type(error).__name__}
+        return failed(error, places)
 
 
 def _input(task: JobTask, name: str) -> Path | None:

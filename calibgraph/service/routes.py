@@ -11,10 +11,20 @@ from starlette.concurrency import run_in_threadpool
 
 from calibgraph.model.result_files import REPORT_FILE
 from calibgraph.report.kit import page_template
-from calibgraph.service.folders import ARCHIVE, FILES, LOG, RESULT, SUMMARY
 from calibgraph.service.jobs import JobRecord
 from calibgraph.service.problems import Problem
-from calibgraph.service.requests import RECORDING, RIG, TABLE, TEXTS, JobKind
+from calibgraph.service.requests import (
+    ARCHIVE,
+    FILES,
+    LOG,
+    RECORDING,
+    RESULT,
+    RIG,
+    SUMMARY,
+    TABLE,
+    TEXTS,
+    JobKind,
+)
 from calibgraph.service.state import Service, service_of
 from calibgraph.service.uploads import receive_job
 
@@ -59,7 +69,7 @@ async def submit(kind: JobKind, request: Request, response: Response, state: Sta
     """Ask for a job: a form with files, and settings as JSON."""
     size = int(request.headers.get("content-length", "0"))
     await run_in_threadpool(state.require_room, size)
-    id, job = await receive_job(request, kind, state.folder)
+    id, job = await receive_job(request, kind, state)
     record = await run_in_threadpool(state.add, id, job)
     response.headers["Location"] = f"/v1/jobs/{id}"
     return _answer(record, state)
@@ -112,12 +122,12 @@ def cancel_job(id: str, state: State) -> JobRecord:
 def job_log(id: str, state: State) -> str:
     """What the job printed: its last part."""
     _found(state, id)
-    folder = state.folder.of_job(id)
+    folder = state.of_job(id)
     try:
         text = (folder / LOG).read_bytes()[-_MOST_LOG:].decode(errors="replace")
     except FileNotFoundError:  # it expires at this moment
         return ""
-    return text.replace(str(folder), "").replace(str(state.folder.path), "")
+    return text.replace(str(folder), "").replace(str(state.path), "")
 
 
 _RESULTS = {
@@ -135,7 +145,7 @@ def result(id: str, part: Literal["result", "report.html", "files.zip"], state: 
         why = f" ({record.error})" if record.error else ""
         raise Problem(409, f"the job has no result: it is {record.state}{why}")
     name, media_type = _RESULTS[part]
-    path = state.folder.of_job(id) / RESULT / name
+    path = state.of_job(id) / RESULT / name
     if not path.exists():
         raise Problem(404, "no such file: it was not asked for, or has been removed")
     policy = {"Content-Security-Policy": REPORT_POLICY} if part == "report.html" else {}

@@ -15,11 +15,20 @@ from typing import Any
 from fastapi import Request
 
 from calibgraph.child_process import ChildEndedError, ChildProcess, ChildTimeoutError, Outcome
-from calibgraph.service.folders import INPUT, RESULT, SCRATCH, WORK, DataFolder
+from calibgraph.files import require_place_for_folder, sync_to_disk
 from calibgraph.service.jobs import FINISHED, JobRecord, JobTable
 from calibgraph.service.problems import Problem
 from calibgraph.service.request_guard import load_tokens
-from calibgraph.service.requests import Job, JobProgress, JobTask, Settings
+from calibgraph.service.requests import (
+    INPUT,
+    RESULT,
+    SCRATCH,
+    WORK,
+    Job,
+    JobProgress,
+    JobTask,
+    Settings,
+)
 
 log = logging.getLogger("calibgraph.service")
 
@@ -33,21 +42,27 @@ class Service:
     """The parts of a server, and the threads that run its jobs, each in a child process.
 
     Attributes:
+        path: its data folder.
+        arriving: the folder of uploads.
         steps: how far running jobs are, by their ids.
 
     Raises:
-        CalibrationError: if the token file, the data folder or the database cannot be used.
+        CalibrationError: if the token file, the data folder or the database cannot be used, or
+            another server uses them.
     """
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
         self.tokens = None if settings.tokens is None else load_tokens(settings.tokens)
-        self.folder = DataFolder(settings.data)
-        self.jobs = JobTable(self.folder.path)
-        self.folder.clear()
-        self.trackers = Trackers(
-            self.folder.trackers, settings.tracker_processes, settings.memory_bytes
-        )
+        require_place_for_folder(settings.data)
+        settings.data.mkdir(parents=True, exist_ok=True, mode=0o700)
+        self.path = settings.data.resolve()
+        self.jobs = JobTable(self.path)  # which no other server uses
+        self.arriving, trackers = self.path / "arriving", self.path / "trackers"
+        shutil.rmtree(self.arriving, ignore_errors=True)
+        for folder in (self.of_job(""), self.arriving, trackers):
+            folder.mkdir(exist_ok=True, mode=0o700)
+        self.trackers = Trackers(trackers, settings.tracker_processes, settings.memory_bytes)
         self.steps: dict[str, JobProgress] = {}
         module = f"{__package__}.job_process"
         self._children = [ChildProcess(module) for _ in range(settings.jobs_at_once)]
@@ -95,9 +110,20 @@ class Service:
         """Refuse a body of so many bytes if there is no room: it is on the disk twice at first."""
         if self.is_stopping:
             raise Problem(503, "the server is being stopped; try again soon")
-        if shutil.disk_usage(self.folder.path).free - 2 * size < self.settings.free_bytes:
+        if shutil.disk_usage(self.path).free - 2 * size < self.settings.free_bytes:
             self._remove_expired()
             raise Problem(507, "the server's disk has no room for it; try again later")
+
+    def of_job(self, id: str) -> Path:
+        """The folder of a job."""
+        return self.path / "jobs" / id
+
+    def keep(self, arrived: Path) -> None:
+        """Put an upload on disk, and give it its place among the jobs."""
+        for path in (*arrived.rglob("*"), arrived):
+            sync_to_disk(path)
+        arrived.rename(self.of_job(arrived.name))
+        sync_to_disk(self.of_job(""))
 
     def add(self, id: str, job: Job) -> JobRecord:
         """Add a job whose folder is in its place; it is durable when this returns."""
@@ -108,7 +134,7 @@ class Service:
                 raise Problem(429, f"{waiting} jobs wait already; try again later")
             record = self.jobs.add(id, job)
         except BaseException:
-            shutil.rmtree(self.folder.of_job(id), ignore_errors=True)
+            shutil.rmtree(self.of_job(id), ignore_errors=True)
             raise
         self._added.set()
         return record
@@ -128,7 +154,7 @@ class Service:
     def task(self, record: JobRecord) -> JobTask:
         """What the process of a job gets."""
         job = Job.model_validate_json(record.request)
-        return JobTask(job, self.folder.of_job(record.id), self.settings)
+        return JobTask(job, self.of_job(record.id), self.settings)
 
     def _work(self, child: ChildProcess) -> None:
         """A thread: one job after the other."""
@@ -164,7 +190,7 @@ class Service:
                 self.jobs.put_back(record.id)
             else:
                 if outcome.error_kind is None:
-                    folder = self.folder.of_job(record.id)
+                    folder = self.of_job(record.id)
                     shutil.rmtree(folder / RESULT, ignore_errors=True)
                     (folder / WORK).rename(folder / RESULT)
                 else:
@@ -195,17 +221,17 @@ class Service:
     def _discard_input(self, id: str) -> None:
         """Remove all of a finished job that is not its result."""
         for name in (INPUT, SCRATCH, WORK):
-            shutil.rmtree(self.folder.of_job(id) / name, ignore_errors=True)
+            shutil.rmtree(self.of_job(id) / name, ignore_errors=True)
 
     def _remove_expired(self) -> None:
         """Remove the jobs whose results have been kept for long enough, and their folders."""
         for id in self.jobs.remove_finished(time.time() - self.settings.keep_s):
-            shutil.rmtree(self.folder.of_job(id), ignore_errors=True)
+            shutil.rmtree(self.of_job(id), ignore_errors=True)
 
     def _remove_leftovers(self) -> None:
         """Remove the folders of jobs that are not known, and the input of those that ended."""
         states = self.jobs.states()
-        for folder in self.folder.jobs.iterdir():
+        for folder in self.of_job("").iterdir():
             if folder.name not in states:
                 shutil.rmtree(folder, ignore_errors=True)
             elif states[folder.name] in FINISHED:

@@ -10,9 +10,10 @@ from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import FormData, UploadFile
 
 from calibgraph.files import describe
-from calibgraph.service.folders import INPUT, LOG, DataFolder
 from calibgraph.service.problems import Problem
 from calibgraph.service.requests import (
+    INPUT,
+    LOG,
     MAX_RECORDINGS,
     PARTS,
     RECORDING,
@@ -22,11 +23,12 @@ from calibgraph.service.requests import (
     JobKind,
     recording_name,
 )
+from calibgraph.service.state import Service
 
 MOST_TEXT_BYTES = 10**6
 
 
-async def receive_job(request: Request, kind: JobKind, folder: DataFolder) -> tuple[str, Job]:
+async def receive_job(request: Request, kind: JobKind, state: Service) -> tuple[str, Job]:
     """Read the form of a job, which is on disk then; its id, which names its folder, and it."""
     if not request.headers.get("content-type", "").startswith("multipart/form-data"):
         raise Problem(415, "send a form: multipart/form-data")
@@ -38,20 +40,20 @@ async def receive_job(request: Request, kind: JobKind, folder: DataFolder) -> tu
     except LookupError as error:
         raise Problem(400, f"the form cannot be read ({error})") from error
     try:
-        return await run_in_threadpool(_keep, form, kind, folder)
+        return await run_in_threadpool(_keep, form, kind, state)
     finally:
         await form.close()
 
 
-def _keep(form: FormData, kind: JobKind, folder: DataFolder) -> tuple[str, Job]:
+def _keep(form: FormData, kind: JobKind, state: Service) -> tuple[str, Job]:
     """Write the files of a form into the folder of a new job."""
     id = secrets.token_hex(16)
-    arriving = folder.arriving / id
+    arriving = state.arriving / id
     (arriving / INPUT).mkdir(parents=True, mode=0o700)
     try:
         job = _job_of(form, kind, arriving / INPUT)
         (arriving / LOG).touch()
-        folder.keep(arriving)
+        state.keep(arriving)
     finally:
         shutil.rmtree(arriving, ignore_errors=True)
     return id, job

@@ -10,9 +10,9 @@ from starlette.testclient import TestClient
 
 from calibgraph.errors import CalibrationError
 from calibgraph.service.app import create_app
-from calibgraph.service.folders import DataFolder
 from calibgraph.service.jobs import DATABASE
 from calibgraph.service.requests import Settings
+from calibgraph.service.state import Service
 from tests.service.conftest import URL, Make, Problem, service_folder
 
 
@@ -26,7 +26,7 @@ def test_a_full_disk_acknowledges_nothing(
         raise OSError(number, "no space left")
 
     with monkeypatch.context() as patch:
-        patch.setattr(DataFolder, "keep", full)
+        patch.setattr(Service, "keep", full)
         answer = client.post("/v1/jobs/solve", files=small.files)
     assert answer.status_code == 507
     assert client.get("/v1/jobs").json()["jobs"] == []
