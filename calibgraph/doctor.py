@@ -25,7 +25,7 @@ from calibgraph.matching.structure.matcher import MOST_FRAMES
 from calibgraph.model.places import as_groups, describe_places
 from calibgraph.model.rig import Rig
 from calibgraph.parallel import map_on_cores
-from calibgraph.report.page_overlays import write_overlays
+from calibgraph.report.pictures import write_overlays
 from calibgraph.solver.covariance import ENOUGH_FRAMES
 from calibgraph.trust.inputs import (
     Finding,

@@ -24,7 +24,7 @@ MAX_YAML_BYTES = 8 * 2**20
 
 
 def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
-    """Write a temporary file beside ``path`` with ``write``, then rename it in one step.
+    """Write a file of another folder with ``write``, then move it to ``path`` in one step.
 
     A crash leaves the old file or the new one, never half of one.
 
@@ -33,26 +33,14 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
         OSError: if it cannot be written; with the path.
     """
     require_new_file(path, force=True)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = None
-    try:
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=_PREFIX, suffix=path.suffix)
-        os.close(handle)
-        temporary = Path(name)
-        write(temporary)
-        sync_to_disk(temporary)
-        umask = os.umask(0)
-        os.umask(umask)
-        temporary.chmod(0o666 & ~umask)
-        temporary.replace(path)
-        sync_to_disk(path.parent)
-    except OSError as error:
-        if error.filename and not str(error.filename).startswith(f"{path.parent}/.writing-"):
-            raise  # of another file, which is read
-        raise cannot_write(path, error) from error
-    finally:
-        if temporary is not None:
-            temporary.unlink(missing_ok=True)
+    with written_together(path.parent, last=path.name) as new:
+        try:
+            write(new / path.name)
+            sync_to_disk(new / path.name)
+        except OSError as error:
+            if error.filename and not str(error.filename).startswith(str(new)):
+                raise  # of another file, which is read
+            raise cannot_write(path, error) from error
 
 
 def cannot_write(path: Path, error: Exception, number: int | None = None) -> OSError:

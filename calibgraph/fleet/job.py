@@ -31,6 +31,7 @@ from calibgraph.fleet.manifest import Job
 from calibgraph.model.calibration import version_of
 from calibgraph.report.as_json import verdict_summary
 
+RELEASE = version_of("calibgraph")
 _LOG, _MOST_LOG = "log.txt", 2**16
 _kept = threading.local()
 _children: list[ChildProcess] = []
@@ -51,20 +52,15 @@ class Limits:
     fetch_bytes: float = 50e9
 
 
-def release() -> str:
-    """The version of this package."""
-    return version_of("calibgraph")
-
-
 def run_job(job: Job, limits: Limits, of_release: str) -> Outcome:
     """Run a job in the child process of this thread.
 
     Raises:
         CalibrationError: if this machine has another version of the package than the command.
     """
-    if of_release != release():
+    if of_release != RELEASE:
         raise CalibrationError(
-            f"a worker has calibgraph {release()}, the command {of_release}; install the same "
+            f"a worker has calibgraph {RELEASE}, the command {of_release}; install the same "
             "version on all machines"
         )
     if getattr(_kept, "child", None) not in _children:

@@ -28,9 +28,9 @@ from calibgraph.model.result_files import (
 from calibgraph.model.rig import Camera
 from calibgraph.model.verdict import Check, beside, in_unit, is_reachable
 from calibgraph.report.kit import page_template
-from calibgraph.report.lidar_views import draw_lidars
-from calibgraph.report.page_overlays import (
+from calibgraph.report.pictures import (
     depth_scale,
+    draw_lidars,
     draw_overlays,
     width_on_page,
     write_overlays,

@@ -69,9 +69,8 @@ async def submit(kind: JobKind, request: Request, response: Response, state: Sta
     """Ask for a job: a form with files, and settings as JSON."""
     size = int(request.headers.get("content-length", "0"))
     await run_in_threadpool(state.require_room, size)
-    id, job = await receive_job(request, kind, state)
-    record = await run_in_threadpool(state.add, id, job)
-    response.headers["Location"] = f"/v1/jobs/{id}"
+    record = await receive_job(request, kind, state)
+    response.headers["Location"] = f"/v1/jobs/{record.id}"
     return _answer(record, state)
 
 

@@ -118,17 +118,15 @@ class Service:
         """The folder of a job."""
         return self.path / "jobs" / id
 
-    def keep(self, arrived: Path) -> None:
-        """Put an upload on disk, and give it its place among the jobs."""
+    def add(self, arrived: Path, job: Job) -> JobRecord:
+        """Add a job by its folder, named as its id; both are durable when this returns."""
+        self._remove_expired()
         for path in (*arrived.rglob("*"), arrived):
             sync_to_disk(path)
-        arrived.rename(self.of_job(arrived.name))
-        sync_to_disk(self.of_job(""))
-
-    def add(self, id: str, job: Job) -> JobRecord:
-        """Add a job whose folder is in its place; it is durable when this returns."""
-        self._remove_expired()
+        id = arrived.name
+        arrived.rename(self.of_job(id))
         try:
+            sync_to_disk(self.of_job(""))
             waiting = self.jobs.counts().get("queued", 0)
             if waiting >= self.settings.most_queued:
                 raise Problem(429, f"{waiting} jobs wait already; try again later")

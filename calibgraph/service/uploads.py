@@ -10,6 +10,7 @@ from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import FormData, UploadFile
 
 from calibgraph.files import describe
+from calibgraph.service.jobs import JobRecord
 from calibgraph.service.problems import Problem
 from calibgraph.service.requests import (
     INPUT,
@@ -28,8 +29,8 @@ from calibgraph.service.state import Service
 MOST_TEXT_BYTES = 10**6
 
 
-async def receive_job(request: Request, kind: JobKind, state: Service) -> tuple[str, Job]:
-    """Read the form of a job, which is on disk then; its id, which names its folder, and it."""
+async def receive_job(request: Request, kind: JobKind, state: Service) -> JobRecord:
+    """Read the form of a job, and add the job."""
     if not request.headers.get("content-type", "").startswith("multipart/form-data"):
         raise Problem(415, "send a form: multipart/form-data")
     try:
@@ -40,23 +41,21 @@ async def receive_job(request: Request, kind: JobKind, state: Service) -> tuple[
     except LookupError as error:
         raise Problem(400, f"the form cannot be read ({error})") from error
     try:
-        return await run_in_threadpool(_keep, form, kind, state)
+        return await run_in_threadpool(_add, form, kind, state)
     finally:
         await form.close()
 
 
-def _keep(form: FormData, kind: JobKind, state: Service) -> tuple[str, Job]:
-    """Write the files of a form into the folder of a new job."""
-    id = secrets.token_hex(16)
-    arriving = state.arriving / id
+def _add(form: FormData, kind: JobKind, state: Service) -> JobRecord:
+    """Add a job whose folder has the files of a form."""
+    arriving = state.arriving / secrets.token_hex(16)
     (arriving / INPUT).mkdir(parents=True, mode=0o700)
     try:
         job = _job_of(form, kind, arriving / INPUT)
         (arriving / LOG).touch()
-        state.keep(arriving)
+        return state.add(arriving, job)
     finally:
         shutil.rmtree(arriving, ignore_errors=True)
-    return id, job
 
 
 def _job_of(form: FormData, kind: JobKind, folder: Path) -> Job:
