@@ -72,11 +72,11 @@ def _describe(error: Exception) -> tuple[ErrorKind, str]:
 
 
 class ChildEndedError(Exception):
-    """The process ended before its answer, or could not be started."""
+    """The process ended before its answer, or could not be started; after a timeout by us."""
 
-
-class ChildTimeoutError(Exception):
-    """The answer did not come in time; the process was ended."""
+    def __init__(self, text: str, kind: ErrorKind = "worker died") -> None:
+        super().__init__(text)
+        self.kind = kind
 
 
 class ChildProcess:
@@ -124,8 +124,7 @@ class ChildProcess:
         """The answer of the process that :meth:`start` started.
 
         Raises:
-            ChildEndedError: if the process ends first.
-            ChildTimeoutError: if it takes longer.
+            ChildEndedError: if the process ends first, or if it takes longer.
         """
         process, connection = self._process, self._connection
         if process is None or connection is None:  # by another thread
@@ -143,7 +142,7 @@ class ChildProcess:
             self.stop()
             raise ChildEndedError(_how_it_ended(process.wait())) from None
         self.stop()
-        raise ChildTimeoutError(f"took over {timeout_s:g} s")
+        raise ChildEndedError(f"took over {timeout_s:g} s", "timeout")
 
     def stop(self) -> None:
         """End the process, when no other thread uses it; the next request starts another."""

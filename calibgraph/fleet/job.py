@@ -18,7 +18,6 @@ from typing import Any
 from calibgraph.child_process import (
     ChildEndedError,
     ChildProcess,
-    ChildTimeoutError,
     Outcome,
     answer_requests,
     failed,
@@ -73,9 +72,8 @@ def run_job(job: Job, limits: Limits, of_release: str) -> Outcome:
             start = time.perf_counter()  # the libraries' loading is not the job's time
             outcome: Outcome = _kept.child.ask((job, limits, Path(folder)), limits.timeout_s)
         except ChildEndedError as error:
-            outcome = Outcome(error_kind="worker died", error=str(error))
-        except ChildTimeoutError as error:
-            outcome = Outcome(error_kind="timeout", error=f"{error}; see --timeout-s")
+            advice = "; see --timeout-s" if error.kind == "timeout" else ""
+            outcome = Outcome(error_kind=error.kind, error=f"{error}{advice}")
         seconds, log = time.perf_counter() - start, Path(folder) / _LOG
         text = log.read_bytes()[-_MOST_LOG:].decode(errors="replace") if log.exists() else ""
     return replace(outcome, seconds=seconds, log=text)

@@ -165,7 +165,6 @@ def _problem(points_m: Array) -> str:
 
 
 SESSION_FILE = "session.json"
-SESSION_FORMAT: Literal["calibgraph-pick/2"] = "calibgraph-pick/2"
 _Number = Annotated[float, Field(ge=-1e6, le=1e6)]
 
 
@@ -194,7 +193,7 @@ class Session(StrictNumbers):
         pairs: in the order in which they were picked.
     """
 
-    format: Literal["calibgraph-pick/2"] = SESSION_FORMAT
+    format: Literal["calibgraph-pick/2"] = "calibgraph-pick/2"
     frames: tuple[str, ...]
     cameras: tuple[str, ...]
     pairs: Annotated[tuple[Pair, ...], Field(max_length=2000)] = ()

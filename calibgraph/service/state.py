@@ -14,7 +14,7 @@ from typing import Any
 
 from fastapi import Request
 
-from calibgraph.child_process import ChildEndedError, ChildProcess, ChildTimeoutError, Outcome
+from calibgraph.child_process import ChildEndedError, ChildProcess, Outcome
 from calibgraph.files import require_place_for_folder, sync_to_disk
 from calibgraph.service.jobs import FINISHED, JobRecord, JobTable
 from calibgraph.service.problems import Problem
@@ -209,9 +209,9 @@ class Service:
                 return None
             note, most_s = partial(self.steps.__setitem__, record.id), self.settings.job_timeout_s
             return child.ask(self.task(record), most_s, note)  # type: ignore[no-any-return]
-        except ChildTimeoutError as error:
-            return Outcome(error_kind="timeout", error=f"{error}; give fewer frames")
         except ChildEndedError as error:
+            if error.kind == "timeout":
+                return Outcome(error_kind="timeout", error=f"{error}; give fewer frames")
             if not self.is_stopping:
                 log.warning("job %s: %s", record.id, error)
             return None
@@ -268,5 +268,5 @@ def _ask(child: ChildProcess, request: Any) -> tuple[int, str]:
     try:
         child.start()
         return child.ask(request, 120.0)  # type: ignore[no-any-return]
-    except (ChildEndedError, ChildTimeoutError) as error:
+    except ChildEndedError as error:
         return 503, f"{error}; send the frames again: those that were taken in are known"
