@@ -96,7 +96,7 @@ def diagnose(
         ValueError: if the options do not fit.
     """
     found: _Found = {"error": [], "warning": [], "note": []}
-    data = _load(folders, rig, frames, bag, found=found)
+    data = _load(folders, rig, found, frames=frames, bag=bag)
     count, seen, written = 0, dict[str, int](), list[Path]()
     if data is not None:
         count = len(data.frames)
@@ -108,19 +108,15 @@ def diagnose(
 
 
 def _load(
-    folders: Sequence[Path],
-    rig: Rig | None,
-    frames: str | None,
-    bag: BagOptions | None,
-    *,
-    found: _Found,
+    folders: Sequence[Path], rig: Rig | None, found: _Found, **options: Any
 ) -> Dataset | None:
     """The dataset, without frames that do not pair up; None if there is none."""
     try:
-        return load_dataset(folders, rig, frames=frames, bag=bag)
+        return load_dataset(folders, rig, **options)
     except (CalibrationError, OSError) as error:
         found["error"].append(str(error))
-        if not isinstance(error, DatasetError) or frames is not None or any(map(is_bag, folders)):
+        is_selected = options["frames"] is not None or any(map(is_bag, folders))
+        if not isinstance(error, DatasetError) or is_selected:
             return None
     try:
         given = rig if rig is not None else load_rig(folders[0])

@@ -1,14 +1,19 @@
-"""Routes of jobs and of their results, of trackers, the page and health."""
+"""Routes of jobs, their forms and results, of trackers, the page and health."""
 
 import asyncio
+import secrets
+import shutil
 import time
+from pathlib import Path
 from typing import Annotated, Literal
 
 from fastapi import APIRouter, Depends, Query, Request
 from fastapi.responses import FileResponse, HTMLResponse, PlainTextResponse, Response
-from pydantic import BaseModel, StringConstraints
+from pydantic import BaseModel, StringConstraints, ValidationError
 from starlette.concurrency import run_in_threadpool
+from starlette.datastructures import FormData, UploadFile
 
+from calibgraph.files import describe
 from calibgraph.model.result_files import REPORT_FILE
 from calibgraph.report.kit import page_template
 from calibgraph.service.jobs import JobRecord
@@ -16,17 +21,22 @@ from calibgraph.service.problems import Problem
 from calibgraph.service.requests import (
     ARCHIVE,
     FILES,
+    INPUT,
     LOG,
+    MAX_RECORDINGS,
+    PARTS,
     RECORDING,
     RESULT,
     RIG,
+    SETTINGS_OF,
     SUMMARY,
     TABLE,
     TEXTS,
+    Job,
     JobKind,
+    recording_name,
 )
 from calibgraph.service.state import Service, service_of
-from calibgraph.service.uploads import receive_job
 
 State = Annotated[Service, Depends(service_of)]
 Before = Annotated[int | None, Query(ge=0, le=2**62)]
@@ -42,6 +52,7 @@ REPORT_POLICY = (
 _LONGEST_WAIT_S = 60.0
 _LONGEST_PAUSE_S = 0.5
 _MOST_LOG = 2**20
+_MOST_TEXT_BYTES = 10**6
 
 
 class JobList(BaseModel):
@@ -69,9 +80,62 @@ async def submit(kind: JobKind, request: Request, response: Response, state: Sta
     """Ask for a job: a form with files, and settings as JSON."""
     size = int(request.headers.get("content-length", "0"))
     await run_in_threadpool(state.require_room, size)
-    record = await receive_job(request, kind, state)
+    record = await _receive_job(request, kind, state)
     response.headers["Location"] = f"/v1/jobs/{record.id}"
     return _answer(record, state)
+
+
+async def _receive_job(request: Request, kind: JobKind, state: Service) -> JobRecord:
+    """Read the form of a job, and add the job."""
+    if not request.headers.get("content-type", "").startswith("multipart/form-data"):
+        raise Problem(415, "send a form: multipart/form-data")
+    most = {"max_files": MAX_RECORDINGS + 2, "max_fields": MAX_RECORDINGS + 5}
+    try:
+        async with request.form(**most, max_part_size=_MOST_TEXT_BYTES) as form:
+            return await run_in_threadpool(_add, form, kind, state)
+    except LookupError as error:
+        raise Problem(400, f"the form cannot be read ({error})") from error
+
+
+def _add(form: FormData, kind: JobKind, state: Service) -> JobRecord:
+    """Add a job whose folder has the files of a form."""
+    arriving = state.arriving / secrets.token_hex(16)
+    (arriving / INPUT).mkdir(parents=True, mode=0o700)
+    try:
+        job = _job_of(form, kind, arriving / INPUT)
+        (arriving / LOG).touch()
+        return state.add(arriving, job)
+    finally:
+        shutil.rmtree(arriving, ignore_errors=True)
+
+
+def _job_of(form: FormData, kind: JobKind, folder: Path) -> Job:
+    """The job of a form; files are written, texts are settings or words for people."""
+    texts, counts = dict[str, str](), dict[str, int]()
+    for name, value in form.multi_items():
+        if name in TEXTS and isinstance(value, str):
+            texts[name] = value
+            continue
+        if name not in PARTS[kind]:
+            known = ", ".join((*PARTS[kind], *TEXTS))
+            raise Problem(422, f"unknown field {name[:60]!r}; known are {known}")
+        count = counts[name] = counts.get(name, 0) + 1
+        if count > (MAX_RECORDINGS if name == RECORDING else 1):
+            raise Problem(422, f"{name!r} is given {count} times")
+        target = recording_name(count - 1) if name == RECORDING else name
+        if not isinstance(value, UploadFile):
+            raise Problem(422, f"{name!r} is a text; send it as a file")
+        with (folder / target).open("xb") as file:
+            shutil.copyfileobj(value.file, file, 2**20)
+    for name, is_required in PARTS[kind].items():
+        if is_required and name not in counts:
+            raise Problem(422, f"{name!r} is missing; add it as a file")
+    try:
+        settings = SETTINGS_OF[kind].model_validate_json(texts.pop("settings", "") or "{}")
+        recordings, kept = counts.get(RECORDING, 0), settings.model_dump(mode="json")
+        return Job(kind=kind, recordings=recordings, settings=kept, **texts)
+    except ValidationError as error:
+        raise Problem(422, describe(error)) from error
 
 
 @router.get("/v1/jobs")
