@@ -209,8 +209,7 @@ def doctor(
             pairs += [("--topic", each) for each in topic or ()]
             words = [*dataset, *(word for pair in pairs for word in pair)]
             lines.append(f"no faults; next: calibgraph calibrate {join(map(str, words))}")
-        for line in lines:
-            print_line(line)
+        print_line(*lines)
     if not found.healthy:
         raise typer.Exit(1)
 
@@ -276,8 +275,7 @@ def export(
         print_line(f"warning: --lidar-pose {lidar_pose!r}: lengths in millimetres?")
     lines = [f"warning: {line}" for line in find_implausible(rig)]
     lines += describe_changes(before, read_kit(out)) if before else []
-    for line in [*lines, *(f"{path}: written ({format})" for path in written)]:
-        print_line(line)
+    print_line(*lines, *(f"{path}: written ({format})" for path in written))
 
 
 def _parse_pose(text: str) -> NDArray[np.float64]:
@@ -332,5 +330,4 @@ def simulate(
             step_m=step_m, seed=seed, rotation_deg=rotation_deg, translation_m=translation_m,
             progress=progress,
         )  # fmt: skip
-    for path in written:
-        print_line(f"{path}: written")
+    print_line(*(f"{path}: written" for path in written))

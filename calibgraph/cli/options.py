@@ -41,8 +41,7 @@ def dataset_from(
         data = calibgraph.load_dataset(
             folders, known, frames=frames, bag=bag, interval_s=interval_s
         )
-    for note in data.notes:
-        print_line(note)
+    print_line(*data.notes)
     return data
 
 

@@ -124,10 +124,9 @@ def rig(
         print_json(found | written | (guess.to_mapping() if guess else {}))
         return
     lines = [f"{each['topic']}  {each['type']}  {each['messages']}" for each in topics]
-    for line in [*lines, *(guess.lines if guess else calibgraph.describe_rig(made)), *notes]:
-        print_line(line)
+    lines += [*(guess.lines if guess else calibgraph.describe_rig(made)), *notes]
     end = f"{out}: written" if out is not None else "nothing was written; --out writes the rig"
-    print_line(f"{end}; check the sentences above against the vehicle")
+    print_line(*lines, f"{end}; check the sentences above against the vehicle")
 
 
 def _is_to_fill_in(path: Path) -> bool:

@@ -229,5 +229,4 @@ def _print(summary: Summary, report: FleetReport, out: str) -> None:
     ]
     lines += [f"{vehicle}: all cameras moved alike: the LiDAR was moved"
               for vehicle in report.moved_lidars]  # fmt: skip
-    for line in [*lines, f"wrote {out}/fleet.html"]:
-        print_line(line)
+    print_line(*lines, f"wrote {out}/fleet.html")

@@ -43,9 +43,10 @@ def terminal() -> Console:
     return Stderr(stderr=True)
 
 
-def print_line(text: str) -> None:
-    """Print a line on stderr as it is: no markup, no colours, no line breaks of rich's own."""
-    terminal().out(text, highlight=False)
+def print_line(*lines: str) -> None:
+    """Print lines on stderr as they are: no markup, no colours, no line breaks of rich's own."""
+    for text in lines:
+        terminal().out(text, highlight=False)
 
 
 def elapsed_s() -> float:
