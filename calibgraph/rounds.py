@@ -203,8 +203,8 @@ def rematch(run: MatchingRun, *, confirmed: bool = False) -> MatchingRun:
         better = better_cameras(run, again, found, ratio=_BETTER)
         if not better:
             return run
-        apart = compare_ends(run)
-        far = any(check.status == "FAIL" for name in better for check in apart[name])
+        apart = (check.status for name, check in compare_ends(run) if name in better)
+        far = "FAIL" in apart
         run = with_cameras_of(run, again, better)
         return rematch(run, confirmed=True) if far and not confirmed else run
     except CorrespondenceError as error:
@@ -278,9 +278,8 @@ def run_again(
 
 def _moves_on(rounds: Sequence[RoundSummary], table: Correspondences, config: Config) -> bool:
     """Whether the last of several rounds moved a camera that is found beyond what a PASS allows."""
-    missed, checks = table.findings.missed, check_moves(rounds[-1], config.tolerance)
-    found = [check for name, of in checks.items() if name not in missed for check in of]
-    return len(rounds) > 1 and any(check.status != "PASS" for check in found)
+    missed, checks = table.findings.missed, check_moves(rounds, config.tolerance)
+    return any(name not in missed and check.status != "PASS" for name, check in checks)
 
 
 def better_cameras(

@@ -51,7 +51,7 @@ from calibgraph.rounds import (
 from calibgraph.solver.joint import solve_without_failing
 from calibgraph.solver.solution import Solution
 from calibgraph.trust.agreement import competing_solution_checks, pair_agreement_checks
-from calibgraph.trust.evidence import Checks, Evidence, concatenate, gather_of_run
+from calibgraph.trust.evidence import Evidence, Found, by_camera, gather_of_run
 from calibgraph.trust.guess import point_distance_checks
 from calibgraph.trust.image_evidence import frames_check, measure_image_evidence
 from calibgraph.trust.inputs import describe_copies
@@ -63,7 +63,7 @@ from calibgraph.vehicle.joined import JoinedMatcher, join_clouds
 
 _log = logging.getLogger(__name__)
 
-DOUBTS: tuple[Callable[[Evidence], Checks], ...] = (
+DOUBTS: tuple[Callable[[Evidence], Found], ...] = (
     point_distance_checks,
     estimate_checks,
     matcher_checks,
@@ -223,7 +223,7 @@ def _judge_lidar(
 
 def _doubts(run: MatchingRun, evidence: Evidence, progress: Progress) -> dict[str, str]:
     """Per camera, why its measurement cannot be trusted; empty if it can."""
-    parts = [check(evidence) for check in DOUBTS] + [last_round_checks(run)]
+    parts = [*(check(evidence) for check in DOUBTS), last_round_checks(run)]
     z_scores = evidence.findings.z_score
     disagree = {name: _doubt_by_z_score(z_scores.get(name)) for name in evidence.cameras}
     open_ = [n for n, doubt in disagree.items() if not (doubt or has_too_few_frames(evidence, n))]
@@ -231,7 +231,7 @@ def _doubts(run: MatchingRun, evidence: Evidence, progress: Progress) -> dict[st
     return {
         name: disagree[name]
         or "; ".join(of_frames.get(name, []) + [c.text for c in checks if c.status == "FAIL"])
-        for name, checks in concatenate(parts, evidence.cameras).items()
+        for name, checks in by_camera(evidence.cameras, *parts).items()
     }
 
 

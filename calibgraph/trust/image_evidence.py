@@ -11,7 +11,7 @@ Per camera, with the scores of :mod:`calibgraph.matching.structure.shift_scores`
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -43,7 +43,7 @@ from calibgraph.parallel import Threads, core_pool
 from calibgraph.progress import Progress, no_progress
 from calibgraph.solver.columns import ColumnFit, apply_twist, block_of, fit_columns
 from calibgraph.solver.lens import MATCH_SHARE
-from calibgraph.trust.evidence import Checks, grade_by_images
+from calibgraph.trust.evidence import Found, grade_by_images
 from calibgraph.trust.lens_parameter import (
     IMAGES,
     NAMES,
@@ -252,7 +252,7 @@ def _fit_at_peaks(
     )
 
 
-def image_checks(run: MatchingRun) -> Checks:
+def image_checks(run: MatchingRun) -> Found:
     """Whether the images agree with a result; nothing if there is no time left for them.
 
     They are scored as by the matcher ``structure``, which does not use all that other matchers use:
@@ -266,39 +266,48 @@ def image_checks(run: MatchingRun) -> Checks:
     solved = run.solution.without_pairs().solved_rig.cameras
     cameras = {name: of for name, of in solved.items() if name not in table.findings.missed}
     if run.out_of_time or not cameras:
-        return {}
+        return
     try:
         evidence = measure_image_evidence(
             run.dataset, Rig(cameras=cameras), places=table.places, seed=config.seed,
             progress=run.progress,
         )  # fmt: skip
     except (CalibrationError, OSError) as error:  # files that its matcher did not need
-        text = f"the images could not be checked: {error}"
-        return {name: [Check("image evidence", "WARN", text)] for name in solved}
+        check = Check("image evidence", "WARN", f"the images could not be checked: {error}")
+        yield from ((name, check) for name in solved)
+        return
     names = {frame.index: frame.name for frame in run.dataset.frames}
-    checks = dict[str, tuple[Check, ...]]()
     for name, found in evidence.items():
         seen = replace(found, lens=()) if table.is_swept else found
-        checks[name] = *evidence_checks(seen, names, config.tolerance), *pairing_checks(seen)
-    return grade_by_images(run, checks)
+        for check in evidence_checks(seen, names, config.tolerance):
+            yield name, grade_by_images(run, check)
 
 
 def evidence_checks(
     found: ImageEvidence, names: Mapping[int, str], tolerance: tuple[float, float] = TOLERANCE
-) -> tuple[Check, ...]:
-    """The checks of one camera's extrinsic and lens by the image evidence."""
+) -> Iterator[Check]:
+    """The checks of one camera by the image evidence: of extrinsic, lens, and pairing of files.
+
+    At a wrong extrinsic the lens cannot be measured.
+    """
     if math.isnan(found.displaced_z_score):
         text = (
             f"the images could not be checked: only {found.groups} places with structure in both "
             "image and cloud"
         )
-        return (Check("image evidence", "WARN", text, found.groups),)
-    displaced = threshold("displaced_z_score").check(found.displaced_z_score)
-    of_pose = displaced, frames_check(found, names)
-    mispaired = found.frames_best <= LENS_FRAMES_BEST
-    if found.displaced_z_score < LENS_Z_SCORE or mispaired:
-        return of_pose  # at a wrong extrinsic the lens cannot be measured
-    return *of_pose, *(check_parameter(each, IMAGES, tolerance) for each in found.lens)
+        yield Check("image evidence", "WARN", text, found.groups)
+        return
+    yield threshold("displaced_z_score").check(found.displaced_z_score)
+    yield frames_check(found, names)
+    if found.displaced_z_score >= LENS_Z_SCORE and found.frames_best > LENS_FRAMES_BEST:
+        yield from (check_parameter(each, IMAGES, tolerance) for each in found.lens)
+    if not math.isnan(found.pair_margin):  # there are neighbouring frames
+        side = "next" if found.pair_offset > 0 else "previous"
+        advice = (
+            f"the images fit the clouds of the {side} frame better; check which image belongs to "
+            "which cloud, and their time stamps"
+        )
+        yield threshold("own_clouds").check(found.pair_margin, advice=advice)
 
 
 def frames_check(found: ImageEvidence, names: Mapping[int, str]) -> Check:
@@ -308,15 +317,3 @@ def frames_check(found: ImageEvidence, names: Mapping[int, str]) -> Check:
     """
     row, lost = threshold("frames_best"), ", ".join(names[n] for n in found.frames_lost[:5])
     return row.check(found.frames_best, advice=f"{lost} fit another extrinsic better: {row.advice}")
-
-
-def pairing_checks(found: ImageEvidence) -> tuple[Check, ...]:
-    """Whether images and clouds belong together; nothing without neighbouring frames."""
-    if math.isnan(found.pair_margin):
-        return ()
-    side = "next" if found.pair_offset > 0 else "previous"
-    advice = (
-        f"the images fit the clouds of the {side} frame better; check which image belongs to "
-        "which cloud, and their time stamps"
-    )
-    return (threshold("own_clouds").check(found.pair_margin, advice=advice),)

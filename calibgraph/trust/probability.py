@@ -32,7 +32,7 @@ from calibgraph.model.verdict import (
     Status,
     Verdict,
 )
-from calibgraph.trust.lens_parameter import LENS_KINDS, probability_of_lens
+from calibgraph.trust.lens_parameter import LENS_KINDS, advise_together, probability_of_lens
 
 TABLES, STRUCTURE = "tables", "structure"
 """The models: of correspondences from any source; of runs of the matcher."""
@@ -55,7 +55,8 @@ def judge(
     TABLES or STRUCTURE.
     """
     of_checks, odds = probability_of_checks(checks, model), _models()[model]["bar_odds"]
-    return Verdict(tuple(checks), ErrorProbability(of_checks, beyond, *tolerance, bar_odds=odds))
+    probability = ErrorProbability(of_checks, beyond, *tolerance, bar_odds=odds)
+    return Verdict(tuple(advise_together(checks)), probability)
 
 
 def probability_of_checks(checks: Sequence[Check], model: str) -> float:

@@ -19,15 +19,14 @@ from calibgraph.pipeline import to_calibration
 from calibgraph.solver.joint import solve_joint
 from calibgraph.trust import image_evidence
 from calibgraph.trust.assess import assess
-from calibgraph.trust.evidence import Evidence
+from calibgraph.trust.evidence import Evidence, by_camera
 from calibgraph.trust.image_evidence import (
     ImageEvidence,
     evidence_checks,
     frames_check,
     measure_image_evidence,
-    pairing_checks,
 )
-from calibgraph.trust.image_record import RunChecks, to_metadata
+from calibgraph.trust.image_record import to_metadata
 from calibgraph.trust.inputs import displacement_of_parts
 from calibgraph.trust.pose_posterior import PosePosterior
 from tests.conftest import SAMPLE, make_pair
@@ -55,8 +54,7 @@ def with_clouds_of(dataset: Dataset, order: list[int]) -> Dataset:
 
 
 def statuses(found: ImageEvidence) -> dict[str, str]:
-    checks = (*evidence_checks(found, NAMES), *pairing_checks(found))
-    return {check.name: check.status for check in checks}
+    return {check.name: check.status for check in evidence_checks(found, NAMES)}
 
 
 def test_all_checks_pass_at_the_truth(dataset: Dataset, truth: Rig) -> None:
@@ -186,9 +184,10 @@ def left_by_run(pair: Rig) -> Run:
     solution = solve_joint(pair, simulated(pair, frames=20))
     posterior = PosePosterior(0.1 * FLAT, FLAT, 0.3)
     evidence = Evidence(solution, pair, {CAMERA: posterior})
-    checks = RunChecks(assess(evidence), {CAMERA: [FAILED]}, {CAMERA: [CAUSE]})
-    table = solution.correspondences
-    seen = table.with_metadata({**table.metadata, **to_metadata(evidence, checks)})
+    of_solution, table = assess(evidence), solution.correspondences
+    causes, of_run = (by_camera(pair.cameras, iter([(CAMERA, of)])) for of in (CAUSE, FAILED))
+    checks = {name: causes[name] + of_solution[name] + of_run[name] for name in pair.cameras}
+    seen = table.with_metadata({**table.metadata, **to_metadata(evidence, causes, of_run)})
     return to_calibration(evidence, checks), seen
 
 
