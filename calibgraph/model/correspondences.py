@@ -329,6 +329,10 @@ def _optional(values: ArrayLike | None, dtype: type) -> Any:
     return None if values is None else np.asarray(values, dtype=dtype)
 
 
+_FILLED = {"information_px": (1.0, 0.0, 1.0), LATE: 0.0}
+"""What tables without it have beside others that have it; of other columns, then none has it."""
+
+
 def concatenate(tables: Sequence[Correspondences]) -> Correspondences:
     """Concatenate tables; the first gives the metadata, but for findings that differ.
 
@@ -338,27 +342,19 @@ def concatenate(tables: Sequence[Correspondences]) -> Correspondences:
     if not tables:
         raise ValueError("no tables to concatenate")
     names = tuple(sorted({name for table in tables for name in table.cameras}))
-    same = "frame", "pixels_px", "points_lidar_m", "confidence"
-    columns: dict[str, Any] = {n: np.concatenate([getattr(t, n) for t in tables]) for n in same}
-    pairs = [(np.array([names.index(n) for n in t.cameras], np.int32), t) for t in tables]
-    found = [number[t.camera_index] if len(t) else t.camera_index for number, t in pairs]
-    columns["camera_index"] = np.concatenate(found)
-    if any(table.information_px is not None for table in tables):
-        stated = [(table.information_px, len(table)) for table in tables]
-        parts = [np.tile([1.0, 0.0, 1.0], (n, 1)) if i is None else i for i, n in stated]
-        columns["information_px"] = np.concatenate(parts)
-    if any(table.late_s is not None for table in tables):
-        late = [np.zeros(len(t)) if t.late_s is None else t.late_s for t in tables]
-        columns[LATE] = np.concatenate(late)
-    for name in ("stamp_ns", "twist_per_s"):
-        given = [getattr(table, name) for table in tables if len(table)]
-        if given and all(column is not None for column in given):
-            columns[name] = np.concatenate(given)
+    parts, columns = [t for t in tables if len(t)] or [*tables[:1]], dict[str, Any]()
+    for name, of in Correspondences.COLUMNS.items():
+        given = [getattr(table, name) for table in parts]
+        if name in _FILLED and any(column is not None for column in given):
+            filled = (np.full((len(table), *of.of_row), _FILLED[name]) for table in parts)
+            given = [a if b is None else b for a, b in zip(filled, given, strict=True)]
+        columns[name] = None if any(c is None for c in given) else np.concatenate(given)
+    pairs = [(np.array([names.index(n) for n in t.cameras], np.int32), t) for t in parts]
+    numbers = [number[table.camera_index] for number, table in pairs]
     known = [table.metadata for table in tables if len(table) or table.metadata] or [{}]
     joined = tables[0].with_metadata(joined_metadata(known))
-    vars(joined).update(
-        {**dict.fromkeys(tables[0].COLUMNS), **columns, "cameras": names}
-    )  # as checked
+    columns |= {"cameras": names, CAMERA_INDEX: np.concatenate(numbers)}
+    vars(joined).update(columns)  # as checked
     return joined
 
 
