@@ -64,14 +64,9 @@ class CameraMatches(Table):
     @staticmethod
     def empty(cameras: Sequence[str], metadata: dict[str, Any] | None = None) -> CameraMatches:
         """A table without rows."""
-        return CameraMatches(
-            cameras=tuple(cameras),
-            camera_index=np.empty((0, 2), np.int32),
-            frame=np.empty(0, np.int64),
-            pixels_px=np.empty((0, 2, 2)),
-            planes_lidar_per_m=np.empty((0, 2, 3)),
-            metadata=metadata or {},
-        )
+        of = CameraMatches.COLUMNS.items()
+        columns: dict[str, Any] = {name: np.empty((0, *c.of_row), c.kind) for name, c in of}
+        return CameraMatches(cameras=tuple(cameras), metadata=metadata or {}, **columns)
 
     def __repr__(self) -> str:
         counts = ", ".join(f"{a}-{b}: {len(self.of_pair(a, b))}" for a, b in self.pairs())
