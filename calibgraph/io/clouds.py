@@ -96,20 +96,17 @@ def seconds_after(stamp_ns: int | None, times: NDArray[Any], where: str) -> NDAr
     They are whole numbers of nanoseconds after it (Ouster, Livox), seconds after it (Velodyne), or
     float64 stamps of their own, in seconds (Hesai, RoboSense) or nanoseconds.
     """
-    if stamp_ns is None:
-        first, unit = (
-            times.min(initial=np.inf),
-            1 if times.max(initial=0) > _NANOSECOND_STAMPS else 1e9,
-        )
-        stamp_ns = int(first * unit) if times.dtype.kind == "f" and first > _STAMPS else 0
-    if times.dtype.kind in "iu":
-        seconds = times.astype(np.float64) / 1e9
-    elif times.max(initial=0.0) > _NANOSECOND_STAMPS:
-        seconds = (times.astype(np.float64) - stamp_ns) / 1e9
-    elif times.max(initial=0.0) > _STAMPS:
-        seconds = times.astype(np.float64) - stamp_ns // 10**9 - stamp_ns % 10**9 / 1e9
-    else:
-        seconds = times.astype(np.float64)
+    seconds, latest, is_float = (
+        times.astype(np.float64),
+        times.max(initial=0),
+        times.dtype.kind == "f",
+    )
+    in_ns = latest > _NANOSECOND_STAMPS or not is_float
+    if is_float and latest > _STAMPS:
+        start_ns = int(seconds.min() * (1 if in_ns else 1e9)) if stamp_ns is None else stamp_ns
+        whole, part = (start_ns, 0.0) if in_ns else (start_ns // 10**9, start_ns % 10**9 / 1e9)
+        seconds = seconds - whole - part
+    seconds = seconds / 1e9 if in_ns else seconds
     if not np.all(np.abs(seconds) <= _LONGEST_S):  # not finite, too
         raise DatasetError(
             f"{where}: times from {np.min(seconds):.3g} to {np.max(seconds):.3g} s after the "

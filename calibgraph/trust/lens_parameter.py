@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from functools import cached_property
@@ -23,7 +23,7 @@ from calibgraph.graph.lens import LensVariable
 from calibgraph.model.config import LensPart
 from calibgraph.model.lens import LensSigmas
 from calibgraph.model.rig import Camera
-from calibgraph.model.verdict import FAIL_ABOVE, PASS_BELOW, TOLERANCE, Check, Status
+from calibgraph.model.verdict import TOLERANCE, Check
 from calibgraph.solver.columns import Marginal
 from calibgraph.trust.thresholds import LENS_WRONG, LENS_WRONG_SHARE, threshold
 from factors import Columns
@@ -264,13 +264,3 @@ def advise_together(checks: Sequence[Check]) -> list[Check]:
         else check
         for check in checks
     ]
-
-
-def probability_of_lens(values: Iterable[tuple[str, Status, float | None]]) -> float:
-    """The probability that the worst of the lens parameters is wrong, by (kind, status, value).
-
-    One that is a WARN counts as one, whatever its value.
-    """
-    most: dict[Status, float] = {"FAIL": 1.0, "WARN": FAIL_ABOVE, "PASS": PASS_BELOW}
-    of_lens = [(status, value) for kind, status, value in values if kind in LENS_KINDS]
-    return max([0.0, *(min(value or 0.0, most[status]) for status, value in of_lens)])
