@@ -10,6 +10,7 @@ starts from. With ``cmrnext`` and with tables of correspondences, Stage 1 is the
 """
 
 import logging
+from collections.abc import Collection
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -39,9 +40,9 @@ from calibgraph.rounds import (
     refine_with_camera_pairs,
 )
 from calibgraph.solver.joint import solve_joint
-from calibgraph.trust.assess import assess, assess_run, in_order
-from calibgraph.trust.evidence import Evidence
-from calibgraph.trust.image_record import ImageRecord, RunChecks, to_metadata
+from calibgraph.trust.assess import assess, assess_run
+from calibgraph.trust.evidence import Checks, Evidence
+from calibgraph.trust.image_record import ImageRecord
 from calibgraph.trust.inputs import registered_twists
 from calibgraph.trust.lens_checks import asks_offset
 from calibgraph.trust.probability import STRUCTURE, TABLES, judge
@@ -131,8 +132,7 @@ def _finish(run: MatchingRun) -> tuple[Calibration, Array]:
         thinned = describe_thinned(len(frame.load_cloud()) for frame in run.dataset.frames)
         run, evidence = go_on_elsewhere(run)  # where the rounds ended wrong
         with run.watch("checks"):
-            checks = assess_run(run, evidence)
-            record = to_metadata(evidence, checks)
+            checks, record = assess_run(run, evidence)
     for line in thinned:
         _log.warning(line)
     run.progress("done", 1, 1)
@@ -216,23 +216,26 @@ def solve(
     with watch("checks"):
         excluded, posteriors = solution.config.excluded_cameras, record.posteriors_of(solution)
         evidence = Evidence(solution, rig, posteriors, excluded)
-        checks = record.checks(evidence, assess(evidence))
-    result = to_calibration(evidence, checks)
+        checks, unseen = record.join(evidence, assess(evidence))
+    result = to_calibration(evidence, checks, unseen)
     motion = solution.correspondences
     unused = unused_times(rig, is_known=motion.twist_per_s is not None)
     warnings = (*unused, *odd_motions(motion))
     return replace(result, warnings=warnings, timings_s={**result.timings_s, **watch.seconds})
 
 
-def to_calibration(evidence: Evidence, checks: RunChecks) -> Calibration:
-    """A solution with its error bar, and its verdict by all checks."""
+def to_calibration(evidence: Evidence, checks: Checks, unseen: Collection[str] = ()) -> Calibration:
+    """A solution with its error bar, and its verdict by all checks.
+
+    ``unseen`` are cameras whose images were not looked at.
+    """
     solution, cameras = evidence.solution, evidence.cameras
     tolerance, matcher = solution.config.tolerance, solution.correspondences.matcher
     model = STRUCTURE if matcher == STRUCTURE else TABLES
-    models = dict.fromkeys(cameras, model) | dict.fromkeys(checks.unseen, TABLES)
+    models = dict.fromkeys(cameras, model) | dict.fromkeys(unseen, TABLES)
     verdicts = {
-        name: judge(each, evidence.probability_beyond(name), tolerance, models[name])
-        for name, each in in_order(checks, cameras).items()
+        name: judge(checks[name], evidence.probability_beyond(name), tolerance, models[name])
+        for name in cameras
     }
     result = Calibration(
         rig=with_sigmas(solution.solved_rig, solution.lens),
