@@ -50,9 +50,9 @@ from calibgraph.rounds import (
 from calibgraph.solver.joint import solve_without_failing
 from calibgraph.solver.solution import Solution
 from calibgraph.trust.agreement import competing_solution_checks, pair_agreement_checks
-from calibgraph.trust.evidence import Checks, Evidence, concatenate, gather_of_run
+from calibgraph.trust.evidence import Evidence, Found, by_camera, gather_of_run
 from calibgraph.trust.guess import point_distance_checks
-from calibgraph.trust.image_evidence import frames_check, measure_image_evidence
+from calibgraph.trust.image_evidence import check_images
 from calibgraph.trust.inputs import describe_copies
 from calibgraph.trust.lens_checks import intrinsics_checks
 from calibgraph.trust.matcher_checks import last_round_checks, matcher_checks
@@ -62,7 +62,7 @@ from calibgraph.vehicle.joined import joint_covariance
 
 _log = logging.getLogger(__name__)
 
-DOUBTS: tuple[Callable[[Evidence], Checks], ...] = (
+DOUBTS: tuple[Callable[[Evidence], Found], ...] = (
     point_distance_checks,
     estimate_checks,
     matcher_checks,
@@ -219,7 +219,7 @@ def _judge_lidar(
 
 def _doubts(run: MatchingRun, evidence: Evidence, progress: Progress) -> dict[str, str]:
     """Per camera, why its measurement cannot be trusted; empty if it can."""
-    parts = [check(evidence) for check in DOUBTS] + [last_round_checks(run)]
+    parts = [*(check(evidence) for check in DOUBTS), last_round_checks(run)]
     z_scores = evidence.findings.z_score
     disagree = {name: _doubt_by_z_score(z_scores.get(name)) for name in evidence.cameras}
     open_ = [n for n, doubt in disagree.items() if not (doubt or has_too_few_frames(evidence, n))]
@@ -227,7 +227,7 @@ def _doubts(run: MatchingRun, evidence: Evidence, progress: Progress) -> dict[st
     return {
         name: disagree[name]
         or "; ".join(of_frames.get(name, []) + [c.text for c in checks if c.status == "FAIL"])
-        for name, checks in concatenate(parts, evidence.cameras).items()
+        for name, checks in by_camera(evidence.cameras, *parts).items()
     }
 
 
@@ -242,10 +242,9 @@ def _doubts_by_frames(
         return {}
     rig = run.solution.without_pairs().solved_rig
     rig = rig.model_copy(update={"cameras": {name: rig.cameras[name] for name in cameras}})
-    found = measure_image_evidence(run.dataset, rig, extrinsics_only=True, progress=progress)
-    names = {frame.index: frame.name for frame in run.dataset.frames}
-    checks = {name: frames_check(of_camera, names) for name, of_camera in found.items()}
-    return {name: [check.text] for name, check in checks.items() if check.status != "PASS"}
+    found = check_images(run.dataset, rig, lens=False, pairing=False, progress=progress)
+    of_frames = ((name, check) for name, check in found if check.kind != "displaced_z_score")
+    return {name: [check.text] for name, check in of_frames if check.status != "PASS"}
 
 
 def _doubt_by_z_score(z_score: float | None) -> str:

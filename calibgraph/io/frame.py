@@ -6,7 +6,6 @@ import hashlib
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -328,14 +327,14 @@ class Frame:
         return found
 
     def hashes(self) -> dict[str, str]:
-        """SHA-256 of the cloud and the images, by path; computed once."""
-        return self.derive_for_all(("hashes", self.index), lambda: self._hashes)
-
-    @cached_property
-    def _hashes(self) -> dict[str, str]:
-        found = {path: hashlib.sha256(a.tobytes()).hexdigest() for path, a in self.arrays.items()}
+        """SHA-256 of the cloud and the images, by path; computed once if frames are kept."""
         paths = (self.cloud_path, *self.image_paths.values(), *self.lidar_paths.values())
-        return {str(path): found.get(path) or hash_source(path) for path in paths}
+
+        def compute() -> dict[str, str]:
+            known = {p: hashlib.sha256(a.tobytes()).hexdigest() for p, a in self.arrays.items()}
+            return {str(path): known.get(path) or hash_source(path) for path in paths}
+
+        return self.derive_for_all(("hashes", self.index), compute)
 
     def entry(self) -> dict[str, Any]:
         """The frame's number, files and motion if it is known, as a result keeps them."""
