@@ -110,7 +110,9 @@ def place_by_cameras(
     both = [_cameras_in(side, of) for side, of in sides]
     seen = [camera for camera in rig.cameras if all(camera in of for of in both)]
     if not seen:
-        raise CalibrationError(f"no camera sees what {rig.lidar} and {name} see")
+        raise CalibrationError(
+            f"{rig.lidar} and {name} share no planes, and no camera sees what both see"
+        )
     base, other = (calibrate(side, _with_cameras(of, seen)) for side, of in sides)
     found = [
         n for n in seen if all(side.covariance[n] is not None and side.verdicts[n].status != "FAIL"
