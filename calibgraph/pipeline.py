@@ -14,6 +14,7 @@ from collections.abc import Collection
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -89,18 +90,14 @@ def calibrate(
     config, report = config or Config(), progress or no_progress
     data = dataset if isinstance(dataset, Dataset) else load_dataset(dataset, rig)
     rig = rig if rig and data is dataset else data.rig
-    match = partial(
-        match_in_rounds, config=config, terms=terms, time_limit_s=time_limit_s, progress=report
-    )
-    if not rig.other_lidars:
-        return _finish(match(data, rig, matcher))[0]
+    limits: Any = {"terms": terms, "time_limit_s": time_limit_s, "progress": report}
     watch = Stopwatch()
+    if not rig.other_lidars:
+        return _finish(match_in_rounds(data, rig, matcher, config, **limits))[0]
     with watch("lidars"):
-        data, lidars, joined = find_lidars(
-            data, rig, matcher, config, terms=terms, time_limit_s=time_limit_s, progress=report
-        )
+        data, lidars, joined = find_lidars(data, rig, matcher, config, **limits)
     if rig.cameras:
-        result, by_lidars = _finish(match(data, rig, matcher))
+        result, by_lidars = _finish(match_in_rounds(data, rig, matcher, config, **limits))
     else:
         with watch("hash_inputs"):
             result, by_lidars = _without_cameras(data, rig, config, terms), np.empty((0, 0))
