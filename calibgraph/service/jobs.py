@@ -37,7 +37,7 @@ class JobRecord(BaseModel):
     """A job, as it is answered but for what is of the table alone.
 
     Attributes:
-        number, request, starts: in the table; how often it was started.
+        number, request: in the table.
         created, started, finished: times (UTC); null if not yet.
         progress: of a running job.
         verdict: of the result: PASS, WARN or FAIL; of a check OK, WRONG or CANNOT TELL.
@@ -57,7 +57,6 @@ class JobRecord(BaseModel):
     created: Annotated[datetime, Field(validation_alias="created_s")]
     started: Annotated[datetime | None, Field(validation_alias="started_s")]
     finished: Annotated[datetime | None, Field(validation_alias="finished_s")]
-    starts: Annotated[int, Field(exclude=True)]
     verdict: str | None
     cannot_tell: bool | None
     error_kind: ErrorKind | None
