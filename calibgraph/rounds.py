@@ -209,7 +209,7 @@ def rematch(run: MatchingRun, *, confirmed: bool = False) -> MatchingRun:
         found = [(name,) for name in findings.z_score if name not in lost]
         apart = compare_ends(run)
         run, better = take_better(run, again, found, ratio=_BETTER)
-        far = any(check.status == "FAIL" for name in better for check in apart[name])
+        far = any(name in better and check.status == "FAIL" for name, check in apart)
         return rematch(run, confirmed=True) if far and not confirmed else run
     except CorrespondenceError as error:
         both = {name: (T, T) for name, T in ended.items()}
@@ -282,9 +282,8 @@ def run_again(
 
 def _moves_on(rounds: Sequence[RoundSummary], table: Correspondences, config: Config) -> bool:
     """Whether the last of several rounds moved a camera that is found beyond what a PASS allows."""
-    missed, checks = table.findings.missed, check_moves(rounds[-1], config.tolerance)
-    found = [check for name, of in checks.items() if name not in missed for check in of]
-    return len(rounds) > 1 and any(check.status != "PASS" for check in found)
+    missed, checks = table.findings.missed, check_moves(rounds, config.tolerance)
+    return any(name not in missed and check.status != "PASS" for name, check in checks)
 
 
 def take_better(

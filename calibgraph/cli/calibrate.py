@@ -97,6 +97,7 @@ def match(
     """Find correspondences and write them as a table; exit 1 if a camera was not found."""
     from calibgraph.cli.settings import read_settings
     from calibgraph.files import require_new_file
+    from calibgraph.pipeline import find_lidars
     from calibgraph.rounds import match_in_rounds
 
     require_new_file(out, *TABLE_SUFFIXES, force=force)
@@ -110,6 +111,8 @@ def match(
     data = dataset_from(dataset, rig, frames, bag, interval_s=interval_s)
     limit_s = time_limit_of(matcher, time_limit_s)
     with progress_bar() as progress:
+        if data.rig.other_lidars:  # as of calibrate
+            data, *_ = find_lidars(data, data.rig, chosen, settings, progress=progress)
         run = match_in_rounds(data, matcher=chosen, time_limit_s=limit_s, progress=progress)
         run.correspondences.save(out)
     _print_frames_used(len(run.dataset.frames), data, len(run.copies))

@@ -70,7 +70,7 @@ def _verdict(of: Verdicts, camera: int) -> Verdict:
     name, rows, absent = of.names[camera], pose_rows(camera), int(of.absent[camera])
     own = of.covariance[rows, rows]
     is_free = bool(np.isnan(own).any())
-    checks = check_estimate(
+    estimated = check_estimate(
         used=counts["used"],
         frames=int(of.frames[camera]),
         covariance=None if is_free else own,
@@ -79,6 +79,7 @@ def _verdict(of: Verdicts, camera: int) -> Verdict:
         scatter_only=not of.findings.states_common_error,
         tolerance=of.config.tolerance,
     )
+    checks = [*estimated]
     if repeated >= limit > absent - repeated:
         checks.append(stuck)
     elif absent >= limit:
