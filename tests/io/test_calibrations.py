@@ -134,9 +134,9 @@ def test_tables_of_the_result_before_do_not_stay_beside_the_new_one(
     result = load_calibration(calibrated_sample.folder)
     write_result(result, tmp_path)
     without = replace(result, correspondences=None, camera_matches=None)
-    (written,) = write_result(without, tmp_path, with_report=False)
-    assert written == tmp_path / "calibration.yaml"
-    assert {path.name for path in tmp_path.iterdir()} == {"calibration.yaml", "report.html"}
+    written = write_result(without, tmp_path, with_report=False)
+    assert written[0] == tmp_path / "calibration.yaml"
+    assert {*tmp_path.iterdir()} == {*written, tmp_path / "report.html"}
 
 
 def test_a_result_of_much_metadata_is_replaced_but_no_table_of_others(
