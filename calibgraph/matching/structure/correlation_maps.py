@@ -18,12 +18,11 @@ from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.matching.structure.correlation_kernels import find_best_shifts, sum_z_scores
-from calibgraph.matching.structure.directions import view_angles
+from calibgraph.matching.structure.directions import find_visible, view_angles
 from calibgraph.matching.structure.prepared_cloud import PreparedCloud
 from calibgraph.matching.structure.prepared_image import PreparedImage
-from calibgraph.matching.structure.score_kernel import pad, score_windows
+from calibgraph.matching.structure.score_kernel import LANES, LINES, pad, score_windows
 from calibgraph.matching.structure.shift_scores import group_windows, mean_by_group
-from calibgraph.matching.structure.visibility import find_visible
 from calibgraph.matching.structure.windows import Windows
 from calibgraph.model.rig import Camera
 
@@ -239,10 +238,14 @@ def _to_angular_image(image: PreparedImage, camera: Camera) -> _AngularImage:
     seen = (valid & camera.in_image(pixels)).reshape(right.shape)
     rows, columns = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
     part = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-    small, scale = image.log_gray(camera, STEP_RAD, BLUR_STEPS)
+    padded, scale = image.log_gray(camera, STEP_RAD, BLUR_STEPS)
     places = ((pixels.reshape(*right.shape, 2)[part] + 0.5) * scale - 0.5).astype(np.float32)
     remapped = cv2.remap(
-        small, places[..., 0], places[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        padded[:-LINES, :-LANES],
+        places[..., 0],
+        places[..., 1],
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
     )
     origin_rad = np.array([azimuth[columns[0]], elevation[rows[0]]])
     return _AngularImage(np.asarray(remapped, dtype=np.float32), seen[part], origin_rad)
