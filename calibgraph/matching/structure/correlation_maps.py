@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import cached_property, partial
+from typing import Any
 
 import cv2
 import numpy as np
@@ -78,9 +79,7 @@ class CorrelationMaps:
         win, such as those far back, or those that see few and only the best.
         """
         out = np.zeros(len(T_camera_lidar))
-        maps, points, T = self.maps, self.points_lidar_m, _to_columns(T_camera_lidar)
-        grid = np.array([*self.origin_rad, self.step_rad])
-        sum_z_scores(maps, self.variances, points, T, grid, self._variance_floor, out)
+        sum_z_scores(*self._given(T_camera_lidar), out)
         return out
 
     def find_best_shifts(
@@ -97,19 +96,19 @@ class CorrelationMaps:
         """
         reach = np.rint(np.array(reach_rad) / self.step_rad).astype(np.int64)
         out = np.zeros((len(T_camera_lidar), 3))
-        maps, points, T = self.maps, self.points_lidar_m, _to_columns(T_camera_lidar)
-        grid = np.array([*self.origin_rad, self.step_rad])
-        find_best_shifts(maps, self.variances, points, T, grid, self._variance_floor, reach, out)
+        find_best_shifts(*self._given(T_camera_lidar), reach, out)
         return out[:, 0], out[:, 1:] * self.step_rad
 
     @property
     def _variance_floor(self) -> float:
         return MIN_VARIANCE_SHARE * float(self.variances.sum()) + 1e-12
 
-
-def _to_columns(T: Array) -> NDArray[np.float32]:
-    """(12, n) the first three rows of transforms (n, 4, 4), a column each."""
-    return np.ascontiguousarray(T[:, :3].reshape(len(T), 12).T, dtype=np.float32)
+    def _given(self, T: Array) -> tuple[Any, ...]:
+        """What both kernels are given; the first three rows of transforms as columns (12, n)."""
+        columns = np.ascontiguousarray(T[:, :3].reshape(len(T), 12).T, dtype=np.float32)
+        grid = np.array([*self.origin_rad, self.step_rad])
+        floor = self._variance_floor
+        return self.maps, self.variances, self.points_lidar_m, columns, grid, floor
 
 
 @dataclass(frozen=True, eq=False)

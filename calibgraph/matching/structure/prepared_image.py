@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.matching.structure.score_kernel import pad
-from calibgraph.memory import mmap_copy, mmap_zeros
+from calibgraph.memory import mmap_copy
 from calibgraph.model.rig import Camera
 from calibgraph.parallel import KeyedCache
 
@@ -62,7 +62,7 @@ class PreparedImage:
 
         def scale() -> NDArray[np.float32]:
             small = cv2.resize(cv2.LUT(self.gray, LOG_GRAY), size, interpolation=cv2.INTER_AREA)
-            return pad(np.asarray(cv2.GaussianBlur(small, (0, 0), blur_steps)), mmap_zeros)
+            return pad(np.asarray(cv2.GaussianBlur(small, (0, 0), blur_steps)))
 
         return self.derived.get((self.identity, *size, blur_steps), scale), np.divide(size, whole)
 
