@@ -24,7 +24,6 @@ from calibgraph.matching.structure.pose_search import (
     CONFIDENT,
     PROMISING,
     PoseSearch,
-    SearchRange,
 )
 from calibgraph.progress import no_progress
 from tests.conftest import stereo_relative_pose
@@ -58,7 +57,7 @@ class MadeUp(PoseSearch):
         searched: Mapping[str, list[np.ndarray]] | None = None,
         sees: Mapping[tuple[str, str], tuple[np.ndarray, np.ndarray]] | None = None,
     ) -> None:
-        super().__init__(rig, {}, SearchRange(0.3, 1.5), seed=0, out_of_time=never)
+        super().__init__(rig, {}, (0.3, 1.5), seed=0, out_of_time=never)
         self.z_scores, self.found, self.sees = list(z_scores), dict(searched or {}), sees or {}
         self.searches: list[str] = []
 
@@ -143,9 +142,7 @@ def test_near_the_guess_a_pose_that_does_not_stand_out_is_looked_around(
     monkeypatch.setattr(
         pose_search, "refine", lambda _, body: Candidate(body, z_score, lambda: stands_out)
     )
-    found = Around(one, {}, SearchRange(0.3, 1.5), seed=0, out_of_time=never).near(
-        dict(one.cameras)
-    )
+    found = Around(one, {}, (0.3, 1.5), seed=0, out_of_time=never).near(dict(one.cameras))
     assert (len(looked), found.z_score) == (looks, 72.0 if looks else z_score)
 
 
@@ -176,7 +173,7 @@ def test_of_the_rolls_those_are_tried_until_a_pose_is_beyond_doubt(
             chance = acceptance.probability_by_chance(candidate.z_score, tries)
             return replace(candidate, chance=chance)
 
-    search = Rolled(one, {}, SearchRange(0.3, 1.5), seed=0, out_of_time=never)
+    search = Rolled(one, {}, (0.3, 1.5), seed=0, out_of_time=never)
     search._few = few
     found = search.everywhere(dict(one.cameras), 1, TRIES[1])
     assert (len(tried), found.z_score) == (rolls, max(by_roll[:rolls]))
@@ -202,7 +199,7 @@ def test_a_candidate_that_an_approach_ranks_last_is_refined_too(
     monkeypatch.setattr(PoseSearch, "_correlate", lambda *_: SimpleNamespace(maps=[1]))
     monkeypatch.setattr(PoseSearch, "_settle", lambda _, candidate: candidate)
     frames: Any = {name: SimpleNamespace(cores=None, frames=range(9))}
-    search = PoseSearch(one, frames, SearchRange(0.3, 1.5), seed=0, out_of_time=never)
+    search = PoseSearch(one, frames, (0.3, 1.5), seed=0, out_of_time=never)
     best = search.with_roll(dict(one.cameras), 0.0, effort=1)
     assert best.z_score == CONFIDENT
     np.testing.assert_allclose(lead(best.body).T_camera_lidar, found[-1], atol=1e-9)

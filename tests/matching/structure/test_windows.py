@@ -7,14 +7,16 @@ import pytest
 
 import calibgraph
 from calibgraph import Camera, Intrinsics, Rig
-from calibgraph.matching.structure.directions import sphere_angles, thin, view_angles
+from calibgraph.matching.structure.directions import (
+    find_in_view,
+    find_visible,
+    sphere_angles,
+    thin,
+    view_angles,
+)
 from calibgraph.matching.structure.prepared_cloud import PreparedCloud
 from calibgraph.matching.structure.schedule import LEVELS
 from calibgraph.matching.structure.shift_scores import select_windows
-from calibgraph.matching.structure.visibility import (
-    find_in_view,
-    find_visible,
-)
 from calibgraph.matching.structure.window_table import WindowTable
 from tests.conftest import KANNALA, SAMPLE, make_camera
 
