@@ -92,15 +92,6 @@ def test_the_recording_that_made_the_result_is_named(
     assert json.loads(out)["deployed_verdict"] == "PASS"
 
 
-@pytest.mark.usefixtures("measured_once")
-def test_the_page_shows_the_answer(call: Call, tmp_path: Path) -> None:
-    page = tmp_path / "check.html"
-    code, _, err = call("check", REFERENCE, SAMPLE, "--frames", "0", "--out", page)
-    assert code == 3
-    assert err.rstrip().endswith(f"{page}: written")
-    assert '<strong class="big">CANNOT TELL</strong>' in page.read_text()
-
-
 def test_a_malformed_result_is_refused_before_the_audit(
     call: Call, calibrated_sample: CommandRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
