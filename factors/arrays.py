@@ -10,7 +10,7 @@ from typing import Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.conditioning import fill_root, unit_diagonal
+from factors.conditioning import unit_diagonal
 
 Array = NDArray[np.float64]
 _Number = TypeVar("_Number", bound=np.generic)
@@ -170,20 +170,16 @@ def square_root(sums: BlockSums) -> tuple[Array, Array]:
     """(n + 1,) error and (n + 1, n) Jacobian with the given H, b and c; H may be rank deficient.
 
     H is scaled to a unit diagonal before its root is taken, so that radians and metres lose no
-    digits to each other. The root is triangular; where H is nearly rank deficient, it is by the
-    eigenvectors, and directions without information get a zero row.
+    digits to each other. The root is by the eigenvectors; directions without information get a zero
+    row.
     """
     size = len(sums.gradient)
-    error, jacobian = np.empty(size + 1), np.zeros((size, size + 1))
-    hessian, gradient = contiguous(sums.hessian), contiguous(sums.gradient)
-    if fill_root(hessian, gradient, float(sums.cost), error, jacobian):
-        return error, jacobian.T
-    scaled, units = unit_diagonal(hessian)
+    error, jacobian = np.zeros(size + 1), np.zeros((size + 1, size))
+    scaled, units = unit_diagonal(sums.hessian)
     values, vectors = np.linalg.eigh(scaled)
     known = values > _LEAST * max(values[-1], 0.0)
-    roots = np.sqrt(np.where(known, values, 1.0))
-    error[:size] = np.where(known, vectors.T @ (gradient / units) / roots, 0.0)
-    error[size] = math.sqrt(max(float(sums.cost) - float(error[:size] @ error[:size]), 0.0))
-    jacobian[:, :size] = (vectors * np.where(known, roots, 0.0)) * units[:, None]
-    jacobian[:, size] = 0.0
-    return error, jacobian.T
+    roots, pulls = np.sqrt(values[known]), vectors.T[known] @ (sums.gradient / units)
+    error[:size][known] = pulls / roots
+    error[size] = math.sqrt(max(float(sums.cost) - float(error @ error), 0.0))
+    jacobian[:size][known] = (vectors.T[known] * roots[:, None]) * units
+    return error, jacobian

@@ -203,8 +203,9 @@ def best_in_cell(
     sizes = np.array([[c.width_px, c.height_px] for c in rig.cameras.values()], dtype=np.float64)
     shape = np.array([config.grid_columns, config.grid_rows], dtype=np.float64)
     among = np.ones(len(table), dtype=np.bool_) if among is None else among
-    cell, cells = np.empty(len(table), np.int64), config.grid_columns * config.grid_rows
-    _number_cells(camera, table.pixels_px, sizes, shape, cell)
+    place = (table.pixels_px + 0.5) / sizes.take(camera, axis=0) * shape
+    column, row = np.clip(place, 0.0, shape - 1.0).astype(np.int64).T  # the edge cells go on
+    cell, cells = config.grid_columns * row + column, config.grid_columns * config.grid_rows
     if _are_sorted(camera, table.frame):
         edges = frame_edges(camera, table.frame)
         return np.flatnonzero(_best_of_runs(edges, cells, cell, table.confidence, among))
@@ -240,19 +241,6 @@ def _best_of_runs(
     given = (contiguous(array) for array in (cell, confidence, among))
     _keep_best(edges, np.full(cells, -1), *given, keep)
     return keep
-
-
-@compiled()
-def _number_cells(camera, pixels, sizes, shape, cells):  # type: ignore[no-untyped-def]
-    """Fill (n,) the cell that each pixel lies in; pixels outside belong to the edge cells."""
-    for i in range(len(camera)):
-        which, number = camera[i], np.int64(0)
-        for axis in (1, 0):
-            place = (pixels[i, axis] + 0.5) / sizes[which, axis] * shape[axis]
-            last = shape[axis] - 1.0
-            place = place if place > 0.0 else 0.0
-            number = number * np.int64(shape[axis]) + np.int64(place if place < last else last)
-        cells[i] = number
 
 
 @compiled()

@@ -114,8 +114,8 @@ class Objective:
         T_hat: per camera with a Stage-1 estimate, (4, 4) T_camera_lidar: the mean of the priors.
         config: the weights lambda and mu, the loss and its scales.
         terms: which terms of Eq. 5 are used.
-        gated: after the gate, per camera all correspondences, and the (4, 4) T_camera_lidar and the
-            scale that it was drawn at; before it, empty.
+        gate_hessian: after the gate, (6, 6) per camera, see ``CameraBlock.gate_hessian``; before
+            it, empty.
         pairs: what cameras see in common, each term with its sigma.
         lenses: those that the error model estimates; here they are where the rig has them.
     """
@@ -125,7 +125,7 @@ class Objective:
     T_hat: Mapping[str, Array]
     config: Config
     terms: Terms
-    gated: Mapping[str, tuple[CameraBlock, Array, ResidualScale]] = field(default_factory=dict)
+    gate_hessian: Mapping[str, Array] = field(default_factory=dict)
     pairs: tuple[PairTerm, ...] = ()
     lenses: Mapping[str, LensVariable] = field(default_factory=dict)
 
@@ -162,18 +162,9 @@ class Objective:
         """All terms but the reprojection term: priors and measured relative poses."""
         return objective_graph(self.rig, {}, self.T_hat, self.config, terms=self.terms)
 
-    @cached_property
-    def gate_hessian(self) -> dict[str, Array]:
-        """(6, 6) per camera after the gate, see ``CameraBlock.gate_hessian``."""
-        return {
-            name: block.gate_hessian(T, scale) for name, (block, T, scale) in self.gated.items()
-        }
-
     def with_pairs(self, pairs: Sequence[PairTerm]) -> Objective:
         """The same objective with what cameras see in common."""
-        other = self._with(pairs=tuple(pairs))
-        other.__dict__["gate_hessian"] = self.gate_hessian
-        return other
+        return self._with(pairs=tuple(pairs))
 
     def _with(self, **fields: Any) -> Objective:
         """With other fields, on which the terms between poses do not depend."""
@@ -185,9 +176,7 @@ class Objective:
         """The reprojection term alone, of the cameras that have correspondences."""
         rig = Rig(cameras={name: self.rig.cameras[name] for name in self.blocks})
         pairs = tuple(pair for pair in self.pairs if {pair.a, pair.b} <= self.blocks.keys())
-        free = replace(self, rig=rig, T_hat={}, pairs=pairs)
-        free.__dict__["gate_hessian"] = self.gate_hessian  # the same gate
-        return free
+        return replace(self, rig=rig, T_hat={}, pairs=pairs)
 
     def minimize(
         self, start: Transforms, scales: Scales, *, tolerance: float = RELATIVE_TOLERANCE
@@ -303,8 +292,8 @@ class Objective:
                     "gate is too narrow",
                     camera=name,
                 )
-        gated = {n: (block, T_camera_lidar[n], scales[n]) for n, block in self.blocks.items()}
-        return self._with(blocks=inliers, gated=gated)
+        moving = {n: b.gate_hessian(T_camera_lidar[n], scales[n]) for n, b in self.blocks.items()}
+        return self._with(blocks=inliers, gate_hessian=moving)
 
 
 def best_start(

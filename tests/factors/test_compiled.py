@@ -30,10 +30,10 @@ def twice(x):
     return {factor} * x
 """
 CALL = "from kernels.main import kernel\nprint(kernel(3.0), sum(kernel.stats.cache_hits.values()))"
-ROOT = (
-    "import numpy as np; from factors.conditioning import fill_root as kernel\n"
-    "found = kernel(np.eye(6), np.ones(6), 9.0, np.empty(7), np.zeros((6, 7)))\n"
-    "print(found, sum(kernel.stats.cache_hits.values()))"
+POSES = (
+    "import numpy as np; from factors.pose_kernel import exponential_times as kernel\n"
+    "poses = np.eye(4)[None]; kernel(np.ones((1, 6)), poses)\n"
+    "print(bool(poses[0, 0, 0] < 1), sum(kernel.stats.cache_hits.values()))"
 )
 NOT_KEPT = "calibgraph: compiled code is not kept ("
 
@@ -72,13 +72,13 @@ def read_only(tmp_path: Path) -> Path:
 def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What a first process keeps, in folders that were not there."""
     cache = tmp_path_factory.mktemp("kept") / "above" / "cache"
-    assert run(ROOT, NUMBA_CACHE_DIR=str(cache)) == ("True 0", "")
+    assert run(POSES, NUMBA_CACHE_DIR=str(cache)) == ("True 0", "")
     return cache
 
 
 def test_a_second_process_does_not_compile_again(kept: Path) -> None:
     """The folders are made for the user alone."""
-    assert run(ROOT, NUMBA_CACHE_DIR=str(kept)) == ("True 1", "")
+    assert run(POSES, NUMBA_CACHE_DIR=str(kept)) == ("True 1", "")
     made = kept.parent, kept, *kept.iterdir()
     assert {each.stat().st_mode & 0o777 for each in made} == {0o700}
 
@@ -94,7 +94,7 @@ def test_with_a_read_only_folder_kernels_are_compiled_in_memory_and_one_line_rep
     shutil.copytree("factors", packages / "factors", ignore=shutil.ignore_patterns("__pycache__"))
     (packages / "factors").chmod(0o555)
     (packages / "second.py").write_text(HELPER.format(half=0.5, factor=2))
-    two = ROOT + "\nfrom second import twice; print(twice(2.0) == 4.0)"
+    two = POSES + "\nfrom second import twice; print(twice(2.0) == 4.0)"
     out, err = run(two, path=packages, **{variable: str(read_only)})
     assert out.splitlines() == ["True 0", "True"]
     assert err.startswith(NOT_KEPT) and err.count("\n") == 1
@@ -108,18 +108,18 @@ BY_ANOTHER = "import os; os.geteuid = lambda: 4242\n"
 @pytest.mark.parametrize(
     ("spoil", "code", "why"),
     [
-        (lambda index: index.parents[1].chmod(0o777), ROOT, ": others may write it"),
+        (lambda index: index.parents[1].chmod(0o777), POSES, ": others may write it"),
         pytest.param(
             lambda index: index.parents[2].chmod(0o777),
-            ROOT,
+            POSES,
             ": others may write it",
             marks=pytest.mark.slow,
         ),
         pytest.param(
-            lambda index: index.chmod(0o666), ROOT, ": others may write it", marks=pytest.mark.slow
+            lambda index: index.chmod(0o666), POSES, ": others may write it", marks=pytest.mark.slow
         ),
-        (lambda index: index.symlink_to(index.rename(index.with_name("x"))), ROOT, ": others may"),
-        (lambda index: None, BY_ANOTHER + ROOT, ": belongs to another user)"),
+        (lambda index: index.symlink_to(index.rename(index.with_name("x"))), POSES, ": others may"),
+        (lambda index: None, BY_ANOTHER + POSES, ": belongs to another user)"),
     ],  # fmt: skip
     ids=["folder", "folder above", "file", "link", "another user's"],
 )
@@ -129,7 +129,7 @@ def test_code_that_another_user_may_have_written_is_not_loaded(
     """numba's index is a pickle: this one would make a file."""
     cache, made = tmp_path / "above" / "cache", tmp_path / "made"
     shutil.copytree(kept.parent, cache.parent)
-    (index,) = cache.rglob("*fill_root*.nbi")
+    (index,) = cache.rglob("*exponential_times*.nbi")
     index.write_bytes(b"cbuiltins\nopen\n(V%b\nVw\ntR." % bytes(made))
     spoil(index)
     out, err = run(code, NUMBA_CACHE_DIR=str(cache))
