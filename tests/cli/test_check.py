@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from calibgraph import Audit, Dataset, load_rig
+from calibgraph import Audit, Dataset, load_rig, simulate_correspondences
 from calibgraph.audit import check
 from calibgraph.audit.check import provenance
 from tests.audit.deployed import motion, with_camera_moved
@@ -36,7 +36,14 @@ def measured_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("calibgraph.audit.check", measure)
 
 
-def test_a_right_rig_exits_with_0_and_the_json_names_its_units(call: Call) -> None:
+def test_a_right_rig_exits_with_0_and_the_json_names_its_units(
+    call: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    table = simulate_correspondences(load_rig(REFERENCE), frames=6)
+    monkeypatch.setattr(
+        "calibgraph.audit.check",
+        lambda *given, **kwargs: check(*given, **kwargs | {"matcher": table}),
+    )
     code, out, err = call("check", REFERENCE, SAMPLE, "--json")
     assert code == 0, err  # after 5 s, on a busy machine, err has a line of progress
     content = json.loads(out)

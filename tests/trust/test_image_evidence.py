@@ -160,6 +160,7 @@ def test_parts_that_agree_are_left_alone(cloud: np.ndarray) -> None:
     assert displacement_of_parts(cloud) is None
 
 
+@pytest.mark.realdata
 def test_no_real_cloud_is_named(realdata: Path) -> None:
     clouds = [*realdata.glob("*/lidar/*"), *realdata.glob("kitti_odometry/sequences/*/velodyne/*")]
     assert len(clouds) > 30
