@@ -161,24 +161,3 @@ def test_the_spread_of_a_core_is_found_under_a_broad_background() -> None:
     # Values without a core have the spread of all of them.
     assert robust_spread(rng.uniform(0, 300, 4000)) == pytest.approx(150, rel=0.05)
     assert robust_spread(np.zeros(10)) == 0.0
-
-
-def sorted_spread(values: np.ndarray) -> float:
-    """By its definition, on sorted values."""
-    before, spread = -1.0, 1.762 * np.quantile(values, 0.2)
-    while abs(spread - before) > 1e-6 * before:
-        below = values[values <= 4.0 * spread]
-        before, spread = spread, np.quantile(below, 0.5) if len(below) else spread
-    return float(spread)
-
-
-@pytest.mark.parametrize("count", [1, 2, 30, 700, 3000, 20_000])
-def test_the_spread_is_that_of_sorted_values(count: int) -> None:
-    """Whatever their size, with equal ones among them, and far outliers."""
-    rng = np.random.default_rng(count)
-    for unit in (1e-7, 1e-2, 1.0, 1e6):
-        values = unit * np.abs(rng.standard_normal(count))
-        values[: count // 3] = values[-1]
-        values[count // 2 :: 7] *= 1e4
-        # Interpolation between two values is rounded in another order.
-        assert robust_spread(values) == pytest.approx(sorted_spread(values), rel=1e-12)
