@@ -49,7 +49,6 @@ from calibgraph.pipeline import to_calibration
 from calibgraph.solver.joint import solve_joint
 from calibgraph.trust.assess import assess
 from calibgraph.trust.evidence import Evidence
-from calibgraph.trust.image_record import RunChecks
 from tools.scenes.lens_errors import draw_lens_errors
 from tools.scenes.scan_errors import draw_scan_errors
 from tools.scenes.sensor_streets import ALIGNMENT, RIGS, aligned_rig, mean_poses, render
@@ -196,8 +195,7 @@ def solve_streets(streets: Streets) -> Iterator[tuple[str, Record]]:
         camera_matches=streets.matches,
     )  # fmt: skip
     evidence = Evidence(solved, streets.start)
-    checks = RunChecks(assess(evidence), unseen=evidence.cameras)
-    verdicts = to_calibration(evidence, checks).camera_verdicts
+    verdicts = to_calibration(evidence, assess(evidence), evidence.cameras).camera_verdicts
     joint, mount = solved.covariance, solved.mount
     assert joint is not None and mount.covariance is not None
     errors, T = [], mount.T_camera_lidar

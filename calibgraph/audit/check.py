@@ -6,7 +6,6 @@ from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from calibgraph.arrays import Array
 from calibgraph.audit.judgement import (
@@ -28,7 +27,7 @@ from calibgraph.io.frame import hash_source
 from calibgraph.io.rigs import load_rig
 from calibgraph.matching.burnt_in import describe_burnt_in, hide_burnt_in
 from calibgraph.matching.frame_choice import CANDIDATES, without_copies
-from calibgraph.matching.named import find_matcher, is_table
+from calibgraph.matching.named import find_matcher
 from calibgraph.matching.protocol import FullMatcher
 from calibgraph.matching.run import MatchingRun
 from calibgraph.matching.same_images import require_different_images
@@ -51,19 +50,19 @@ from calibgraph.rounds import (
 from calibgraph.solver.joint import solve_without_failing
 from calibgraph.solver.solution import Solution
 from calibgraph.trust.agreement import competing_solution_checks, pair_agreement_checks
-from calibgraph.trust.evidence import Checks, Evidence, concatenate, gather_of_run
+from calibgraph.trust.evidence import Evidence, Found, by_camera, gather_of_run
 from calibgraph.trust.guess import point_distance_checks
-from calibgraph.trust.image_evidence import frames_check, measure_image_evidence
+from calibgraph.trust.image_evidence import check_images
 from calibgraph.trust.inputs import describe_copies
 from calibgraph.trust.lens_checks import intrinsics_checks
 from calibgraph.trust.matcher_checks import last_round_checks, matcher_checks
 from calibgraph.trust.solution_checks import estimate_checks, outlier_frame_checks
 from calibgraph.trust.thresholds import threshold
-from calibgraph.vehicle.joined import JoinedMatcher, join_clouds
+from calibgraph.vehicle.joined import joint_covariance
 
 _log = logging.getLogger(__name__)
 
-DOUBTS: tuple[Callable[[Evidence], Checks], ...] = (
+DOUBTS: tuple[Callable[[Evidence], Found], ...] = (
     point_distance_checks,
     estimate_checks,
     matcher_checks,
@@ -119,14 +118,10 @@ def check(
     same_recording, verdict = (False, None) if isinstance(rig, Rig) else provenance(rig, given)
     lidars = None
     if deployed.other_lidars:
-        sensors = len(deployed.cameras) + len(deployed.other_lidars)
         with watch("lidars"):
-            lidars = measure_lidars(
-                deployed, given, Config(seed=seed), tolerance, sensors=sensors, progress=report
+            given, lidars = measure_lidars(
+                deployed, given, Config(seed=seed), tolerance, matcher=matcher, progress=report
             )
-            if lidars.poses is not None and not is_table(matcher):
-                given, line = join_clouds(given, deployed, lidars.poses, Config().tolerance)
-                full = FullMatcher(JoinedMatcher(full, lidars.poses)) if line else full
     with watch("choose_frames"):
         data = _open(given, deployed, full) if deployed.cameras else given
     cameras, evidence = dict[str, CameraAudit](), None
@@ -197,24 +192,25 @@ def _judge_lidar(
     None where none is WRONG, or with a single one, which cannot be told from the LiDAR; and where
     a measurement of a camera cannot be trusted.
     """
-    deviations, covariances, poses = list[Array](), list[Array](), list[Array]()
+    deviations, poses = list[Array](), list[Array]()
+    joint, by_lidars = np.empty((0, 0)), np.empty((0, 0))
     if cameras:
         if evidence is None or evidence.joint_covariance is None:
             return None
         deviations += [deviation_of(evidence, name) for name in cameras]
-        covariances.append(evidence.joint_covariance)
+        joint, by_lidars = evidence.joint_covariance, evidence.solution.by_lidars
         poses += [evidence.guess.T_camera_lidar[name] for name in cameras]
     audits = {**cameras}
     if lidars is not None:
         if not lidars.T_lidar_base:
             return None
         deviations.append(lidars.deviation)
-        covariances.append(lidars.covariance)
+        joint = joint_covariance(joint, -by_lidars, lidars.covariance, lidars.by_errors)
         poses += lidars.T_lidar_base
         audits |= lidars.audits
     return find_lidar_motion(
         np.concatenate(deviations),
-        np.asarray(block_diag(*covariances)),
+        joint,
         poses,
         moved=[k for k, each in enumerate(audits.values()) if each.status == "WRONG"],
         quantile=Limits.of(np.inf, FALSE_ALARM_RATE / len(audits), tolerance).axis[0],
@@ -223,7 +219,7 @@ def _judge_lidar(
 
 def _doubts(run: MatchingRun, evidence: Evidence, progress: Progress) -> dict[str, str]:
     """Per camera, why its measurement cannot be trusted; empty if it can."""
-    parts = [check(evidence) for check in DOUBTS] + [last_round_checks(run)]
+    parts = [*(check(evidence) for check in DOUBTS), last_round_checks(run)]
     z_scores = evidence.findings.z_score
     disagree = {name: _doubt_by_z_score(z_scores.get(name)) for name in evidence.cameras}
     open_ = [n for n, doubt in disagree.items() if not (doubt or has_too_few_frames(evidence, n))]
@@ -231,7 +227,7 @@ def _doubts(run: MatchingRun, evidence: Evidence, progress: Progress) -> dict[st
     return {
         name: disagree[name]
         or "; ".join(of_frames.get(name, []) + [c.text for c in checks if c.status == "FAIL"])
-        for name, checks in concatenate(parts, evidence.cameras).items()
+        for name, checks in by_camera(evidence.cameras, *parts).items()
     }
 
 
@@ -246,10 +242,9 @@ def _doubts_by_frames(
         return {}
     rig = run.solution.without_pairs().solved_rig
     rig = rig.model_copy(update={"cameras": {name: rig.cameras[name] for name in cameras}})
-    found = measure_image_evidence(run.dataset, rig, extrinsics_only=True, progress=progress)
-    names = {frame.index: frame.name for frame in run.dataset.frames}
-    checks = {name: frames_check(of_camera, names) for name, of_camera in found.items()}
-    return {name: [check.text] for name, check in checks.items() if check.status != "PASS"}
+    found = check_images(run.dataset, rig, lens=False, pairing=False, progress=progress)
+    of_frames = ((name, check) for name, check in found if check.kind != "displaced_z_score")
+    return {name: [check.text] for name, check in of_frames if check.status != "PASS"}
 
 
 def _doubt_by_z_score(z_score: float | None) -> str:

@@ -6,7 +6,7 @@ result have error bars, which count beside those of the measurement.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -26,9 +26,11 @@ from calibgraph.io.dataset import Dataset
 from calibgraph.model.config import Config
 from calibgraph.model.geometry import invert, twist_between
 from calibgraph.model.rig import Rig
+from calibgraph.pipeline import find_lidars
 from calibgraph.progress import Progress
-from calibgraph.vehicle.lidars import PLACE_FREEDOM, LidarPoses
-from calibgraph.vehicle.rig import LidarResult, calibrate_rig_lidars
+from calibgraph.rounds import AnyMatcher
+from calibgraph.vehicle.lidars import PLACE_FREEDOM
+from calibgraph.vehicle.rig import LidarResult
 
 _LEAST_FREEDOM = 3.0  # of one place, where the size is a prior
 _UNUSABLE = ("lidar_matched", "lidar_start")  # kinds of checks
@@ -43,20 +45,20 @@ class MeasuredLidars:
         deviation: (6 k,) of all, as of an audit; empty if they could not be measured.
         covariance: (6 k, 6 k) of it.
         T_lidar_base: (4, 4) each, as deployed.
-        poses: as measured; None if they could not be.
+        by_errors: (6 k, 6 k) of the deviation by a standard deviation of each error of the poses.
     """
 
     audits: dict[str, CameraAudit]
     deviation: Array
     covariance: Array
     T_lidar_base: list[Array]
-    poses: LidarPoses | None = None
+    by_errors: Array = field(default_factory=lambda: np.empty((0, 0)))
 
 
 def measure_lidars(
-    deployed: Rig, data: Dataset, config: Config, tolerance: Array, *, sensors: int,
-    progress: Progress,
-) -> MeasuredLidars:  # fmt: skip
+    deployed: Rig, data: Dataset, config: Config, tolerance: Array, *,
+    matcher: AnyMatcher = "structure", progress: Progress,
+) -> tuple[Dataset, MeasuredLidars]:  # fmt: skip
     """Measure the LiDARs of a rig again, and compare them with where they are deployed.
 
     Args:
@@ -64,8 +66,11 @@ def measure_lidars(
         data: its frames have their clouds.
         config: of the verdict of what is measured.
         tolerance: (2,) of a turn [rad] and a shift [m].
-        sensors: number of all that are compared, over which false alarms are shared.
+        matcher: of cameras, which place LiDARs that share too little.
         progress: called as the work goes on.
+
+    Returns:
+        The dataset, its clouds joined where cameras gain; and the LiDARs.
 
     Raises:
         RigError: if a LiDAR has no pose.
@@ -77,20 +82,25 @@ def measure_lidars(
             f"lidars.{missing[0]}: has no T_base_lidar, so that there is no pose to compare; "
             "calibrate it first"
         )
-    rig = deployed.model_copy(update={"vehicle": None})
+    rig, sensors = deployed.model_copy(update={"vehicle": None}), len(deployed.cameras) + len(names)
     try:
-        found = calibrate_rig_lidars(data, rig, config, progress=progress)
+        data, found, _ = find_lidars(data, rig, matcher, config, progress=progress)
     except CalibrationError as error:
         if error.__class__ is not CalibrationError:  # of the data
             raise
         audits = {name: CameraAudit("CANNOT TELL", str(error)) for name in names}
-        return MeasuredLidars(audits, np.empty(0), np.empty((0, 0)), [])
+        return data, MeasuredLidars(audits, np.empty(0), np.empty((0, 0)), [])
     T_lidar_base = [invert(known[name]) for name in names]
     now = found.poses.T_base_lidar
     deviations = [
         twist_between(T, invert(now[name])) for name, T in zip(names, T_lidar_base, strict=True)
     ]
-    covariance = _covariance(found, deployed)
+    turns = [deployed.T_base_lidar[name][:3, :3].T for name in names for _ in range(2)]
+    to_own = block_diag(*turns)
+    covariance, by_errors = (
+        to_own @ _covariance(found, deployed) @ to_own.T,
+        to_own @ found.poses.root,
+    )
     freedom = freedom_of_places(found.poses.places, len(names))
     limits = Limits.of(freedom, FALSE_ALARM_RATE / sensors, tolerance)
     audits = {}
@@ -106,7 +116,7 @@ def measure_lidars(
             status, reason, deviations[row], sigma, detectable(sigma, limits.confident)
         )
     deviation = np.concatenate(deviations)
-    return MeasuredLidars(audits, deviation, covariance, T_lidar_base, found.poses)
+    return data, MeasuredLidars(audits, deviation, covariance, T_lidar_base, by_errors)
 
 
 def freedom_of_places(places: int, lidars: int) -> float:
@@ -115,15 +125,11 @@ def freedom_of_places(places: int, lidars: int) -> float:
 
 
 def _covariance(found: LidarResult, deployed: Rig) -> Array:
-    """(6 k, 6 k) of the deviations: of the measurement and, if it is known, of what is deployed."""
-    names, joint = deployed.other_lidars, found.poses.joint_covariance.copy()
-    for row, name in enumerate(names):
-        own = (deployed.lidars or {})[name].covariance
-        if own is not None:
-            joint[6 * row : 6 * row + 6, 6 * row : 6 * row + 6] += own
-    turns = [deployed.T_base_lidar[name][:3, :3].T for name in names for _ in range(2)]
-    to_own = block_diag(*turns)
-    return np.asarray(to_own @ joint @ to_own.T)
+    """(6 k, 6 k) of all poses: of the measurement and, if it is known, of what is deployed."""
+    lidars, nothing = deployed.lidars or {}, np.zeros((6, 6))
+    bars = [lidars[name].covariance for name in deployed.other_lidars]
+    known = [nothing if bar is None else bar for bar in bars]
+    return np.asarray(found.poses.joint_covariance + block_diag(*known))
 
 
 def _doubt(found: LidarResult, name: str) -> str:

@@ -1,6 +1,7 @@
 """Clouds from disk: named fields in .npy, .bin, .pcd, .ply and .feather files; notes on them."""
 
 import io
+import math
 import re
 import struct
 import threading
@@ -8,7 +9,6 @@ import tokenize
 import warnings
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from itertools import chain, islice
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from calibgraph.errors import DatasetError, FileError, in_words
 from calibgraph.files import require_file
+from calibgraph.io.argoverse_lidars import SUFFIXES, file_of, read_lidar
 from calibgraph.io.tables import read_feather
 from calibgraph.model.correspondences import MAX_COORDINATE
 from factors.compiled import compiled
@@ -52,26 +53,6 @@ class RawCloud(NamedTuple):
     fields: tuple[str, ...]
     told: str = ""
     times: NDArray[Any] | None = None
-
-
-@dataclass(frozen=True)
-class Field:
-    """A field of each point.
-
-    Attributes:
-        name: in the file.
-        kind: numpy's type of one number, as <f4.
-        count: how many numbers it has.
-    """
-
-    name: str
-    kind: str
-    count: int = 1
-
-    @property
-    def bytes(self) -> int:
-        """In each point."""
-        return np.dtype(self.kind).itemsize * self.count
 
 
 def find_intensity(names: Iterable[str]) -> str | None:
@@ -116,20 +97,17 @@ def seconds_after(stamp_ns: int | None, times: NDArray[Any], where: str) -> NDAr
     They are whole numbers of nanoseconds after it (Ouster, Livox), seconds after it (Velodyne), or
     float64 stamps of their own, in seconds (Hesai, RoboSense) or nanoseconds.
     """
-    if stamp_ns is None:
-        first, unit = (
-            times.min(initial=np.inf),
-            1 if times.max(initial=0) > _NANOSECOND_STAMPS else 1e9,
-        )
-        stamp_ns = int(first * unit) if times.dtype.kind == "f" and first > _STAMPS else 0
-    if times.dtype.kind in "iu":
-        seconds = times.astype(np.float64) / 1e9
-    elif times.max(initial=0.0) > _NANOSECOND_STAMPS:
-        seconds = (times.astype(np.float64) - stamp_ns) / 1e9
-    elif times.max(initial=0.0) > _STAMPS:
-        seconds = times.astype(np.float64) - stamp_ns // 10**9 - stamp_ns % 10**9 / 1e9
-    else:
-        seconds = times.astype(np.float64)
+    seconds, latest, is_float = (
+        times.astype(np.float64),
+        times.max(initial=0),
+        times.dtype.kind == "f",
+    )
+    in_ns = latest > _NANOSECOND_STAMPS or not is_float
+    if is_float and latest > _STAMPS:
+        start_ns = int(seconds.min() * (1 if in_ns else 1e9)) if stamp_ns is None else stamp_ns
+        whole, part = (start_ns, 0.0) if in_ns else (start_ns // 10**9, start_ns % 10**9 / 1e9)
+        seconds = seconds - whole - part
+    seconds = seconds / 1e9 if in_ns else seconds
     if not np.all(np.abs(seconds) <= _LONGEST_S):  # not finite, too
         raise DatasetError(
             f"{where}: times from {np.min(seconds):.3g} to {np.max(seconds):.3g} s after the "
@@ -168,18 +146,23 @@ def truncated(path: Path, count: int) -> FileError:
     return FileError(path, f"is truncated: it ends before its {count} points; write it again")
 
 
-def binary_columns(
-    path: Path, body: memoryview, count: int, fields: Sequence[Field]
-) -> Iterator[NDArray[Any]]:
-    """The first number of each field of points that lie one after the other, without a copy."""
-    start, step = 0, sum(each.bytes for each in fields)
-    if count * step > len(body):
+class Layout(NamedTuple):
+    """The number of points in a file, the names of their fields, and their type."""
+
+    points: int
+    names: Sequence[str]
+    kind: np.dtype[Any]
+
+
+def binary_columns(path: Path, body: memoryview, layout: Layout) -> list[NDArray[Any]]:
+    """Each field of points that lie one after the other, without a copy."""
+    count, size = layout.points, layout.kind.itemsize
+    if count * size > len(body):
         raise truncated(path, count)
-    if len(body) >= (count + 1) * step:
+    if len(body) >= (count + 1) * size:
         raise _too_long(path, count)
-    for each in fields:
-        yield np.ndarray((count,), each.kind, body, start, (step,))
-        start += each.bytes
+    points = np.frombuffer(body, layout.kind, count)
+    return [points[name] for name in points.dtype.names or ()]
 
 
 def read_rows(
@@ -210,6 +193,7 @@ _SIZES = struct.Struct("<II")  # compressed and uncompressed
 _PCD_KINDS = {f"{letter}{size}" for letter in "IU" for size in (1, 2, 4, 8)} | {"F2", "F4", "F8"}
 _PADDING = "_"
 _MOST_BYTES = 2 * 2**30  # unpacked
+_MOST_NUMBERS = 10**8  # of a field: numpy's types have no more bytes, and no file has so many
 
 
 def read_pcd(path: Path) -> RawCloud:
@@ -223,25 +207,26 @@ def read_pcd(path: Path) -> RawCloud:
     end = _DATA.search(data[:_HEADER_BYTES])
     if end is None:
         raise FileError(path, "has no complete .pcd header; is it complete?")
-    count, fields = _pcd_layout(path, data[: end.start()].decode("ascii", "replace"))
+    layout = _pcd_layout(path, data[: end.start()].decode("ascii", "replace"))
     body, encoding = memoryview(data)[end.end() :], end[1].lower()
     if encoding not in _DATA_READERS:
         raise FileError(path, "has an unknown encoding in its header; write it as binary or ascii")
-    names = [f.name for f in fields if f.count == 1 and f.name != _PADDING]
-    choose_fields(path, names)  # before points are read as if they were right
-    columns = _DATA_READERS[encoding](path, body, count, fields)
-    named = {f.name: column for f, column in zip(fields, columns, strict=True) if f.count == 1}
-    return raw_cloud(path, names, named.__getitem__)
+    single = {
+        name: k for k, name in enumerate(layout.names)
+        if not layout.kind[k].shape and name != _PADDING
+    }  # fmt: skip
+    choose_fields(path, [*single])  # before points are read as if they were right
+    columns = _DATA_READERS[encoding](path, body, layout)
+    return raw_cloud(path, [*single], lambda name: columns[single[name]])
 
 
-def _pcd_layout(path: Path, header: str) -> tuple[int, list[Field]]:
+def _pcd_layout(path: Path, header: str) -> Layout:
     lines = {words[0]: words[1:] for words in map(str.split, header.split("\n")) if words}
     try:
         names = lines.get("FIELDS") or lines["COLUMNS"]
         counts = [read_count(word) for word in lines.get("COUNT", ["1"] * len(names))]
         kinds = [a + b for a, b in zip(lines["TYPE"], lines["SIZE"], strict=True)]
-        types = [f"<{kind.lower()}" for kind in kinds]
-        fields = [Field(*each) for each in zip(names, types, counts, strict=True)]
+        each = [*zip(names, kinds, counts, strict=True)]
         sides = [read_count(lines[side][0]) for side in ("WIDTH", "HEIGHT") if side in lines]
         points = read_count(lines["POINTS"][0]) if "POINTS" in lines else sides[0] * sides[1]
     except (KeyError, IndexError, ValueError) as error:
@@ -252,40 +237,34 @@ def _pcd_layout(path: Path, header: str) -> tuple[int, list[Field]]:
                         "its WIDTH, HEIGHT and POINTS do not fit")  # fmt: skip
     if not points:
         raise FileError(path, "holds no point")
-    return points, fields
+    types = [("", f"<{kind.lower()}", (min(n, _MOST_NUMBERS),) * (n > 1)) for _, kind, n in each]
+    return Layout(points, names, np.dtype(types))
 
 
-def _ascii_columns(
-    path: Path, body: memoryview, count: int, fields: Sequence[Field]
-) -> Iterator[NDArray[Any]]:
+def _ascii_columns(path: Path, body: memoryview, layout: Layout) -> list[NDArray[Any]]:
     """The first number of each field; padding may be left out of the lines."""
-    widths = [sum(f.count for f in fields), sum(f.count for f in fields if f.name != _PADDING)]
-    rows = read_rows(path, body, count, widths)
-    at, full = 0, rows.shape[1] == widths[0]
-    for each in fields:
-        yield rows[:, min(at, rows.shape[1] - 1)]
-        at += each.count * (full or each.name != _PADDING)
+    full = [math.prod(layout.kind[k].shape) for k in range(len(layout.names))]
+    short = [n * (name != _PADDING) for name, n in zip(layout.names, full, strict=True)]
+    rows = read_rows(path, body, layout.points, [sum(full), sum(short)])
+    starts = np.cumsum([0, *(full if rows.shape[1] == sum(full) else short)])
+    return [rows[:, start : start + 1].ravel() for start in starts[:-1]]
 
 
-def _compressed_columns(
-    path: Path, body: memoryview, count: int, fields: Sequence[Field]
-) -> Iterator[NDArray[Any]]:
-    """The first number of each field: the fields lie one after the other, PCL's without padding."""
+def _compressed_columns(path: Path, body: memoryview, layout: Layout) -> list[NDArray[Any]]:
+    """Each field: the fields lie one after the other, PCL's without padding."""
+    count = layout.points
     packed, unpacked = _SIZES.unpack(body[:8]) if len(body) >= _SIZES.size else (1, 0)
-    full = sum(each.bytes for each in fields) * count
-    short = sum(each.bytes for each in fields if each.name != _PADDING) * count
+    full = [layout.kind[k].itemsize * count for k in range(len(layout.names))]
+    short = [n * (name != _PADDING) for name, n in zip(layout.names, full, strict=True)]
     if len(body) < _SIZES.size + packed:
         raise truncated(path, count)
-    fits = unpacked in (full, short) and unpacked <= min(packed * MOST_RATIO, _MOST_BYTES)
+    fits = unpacked in (sum(full), sum(short)) and unpacked <= min(packed * MOST_RATIO, _MOST_BYTES)
     data = np.frombuffer(body, np.uint8, packed, _SIZES.size)
     plain = unpack_lzf(data, unpacked) if fits else None
     if plain is None:
         raise FileError(path, f"its compressed data are not its {count} points; write it again")
-    at = 0
-    for each in fields:
-        skipped = unpacked != full and each.name == _PADDING
-        yield np.ndarray((0 if skipped else count,), each.kind, plain, at, (each.bytes,))
-        at += 0 if skipped else each.bytes * count
+    parts = np.split(plain, np.cumsum(full if unpacked == sum(full) else short)[:-1])
+    return [part.view(layout.kind[k].base) for k, part in enumerate(parts)]
 
 
 _DATA_READERS = {
@@ -350,20 +329,20 @@ def read_ply(path: Path) -> RawCloud:
     if end is None or not data.startswith(b"ply"):
         raise FileError(path, "has no complete .ply header; is it complete?")
     header = data[: end.start()].decode("ascii", "replace")
-    order, count, fields = _ply_layout(path, header)
-    names = [each.name for each in fields]
-    choose_fields(path, names)  # before points are read as if they were right
+    is_text, layout = _ply_layout(path, header)
+    choose_fields(path, layout.names)  # before points are read as if they were right
     body = memoryview(data)[end.end() :]
     columns = (
-        binary_columns(path, body, count, fields) if order
-        else read_rows(path, body, count, [len(fields)]).T
+        read_rows(path, body, layout.points, [len(layout.names)]).T if is_text
+        else binary_columns(path, body, layout)
     )  # fmt: skip
-    return raw_cloud(path, names, dict(zip(names, columns, strict=True)).__getitem__)
+    return raw_cloud(path, layout.names, lambda name: columns[layout.names.index(name)])
 
 
-def _ply_layout(path: Path, header: str) -> tuple[str, int, list[Field]]:
-    """The byte order, "" if it is text; number and fields of the vertices."""
-    order, elements, counts, fields = None, list[str](), dict[str, int](), list[Field]()
+def _ply_layout(path: Path, header: str) -> tuple[bool, Layout]:
+    """Whether it is text; the layout of its vertices."""
+    order, elements, counts = None, list[str](), dict[str, int]()
+    names, kinds = list[str](), list[str]()
     for line in header.split("\n"):
         try:
             match line.split():
@@ -376,7 +355,8 @@ def _ply_layout(path: Path, header: str) -> tuple[str, int, list[Field]]:
                     counts[name] = read_count(number)
                 case ["property", kind, *words] if words:
                     if elements[-1] == "vertex":
-                        fields.append(Field(" ".join(words), _PLY_KINDS[kind]))
+                        names.append(" ".join(words))
+                        kinds.append(_PLY_KINDS[kind])
                 case _:
                     raise ValueError(line)
         except (KeyError, IndexError, ValueError):
@@ -389,7 +369,7 @@ def _ply_layout(path: Path, header: str) -> tuple[str, int, list[Field]]:
         raise FileError(path, "holds no point")
     for name in filter(counts.get, counts):
         raise FileError(path, f"holds {name!r} besides its vertices; write it with these alone")
-    return order, count, [Field(f.name, order + f.kind) for f in fields]
+    return not order, Layout(count, names, np.dtype([("", order + kind) for kind in kinds]))
 
 
 _NAMES = ("x", "y", "z", "intensity", "column 5", "column 6")
@@ -510,8 +490,8 @@ def describe_thinned(sizes: Iterable[int]) -> list[str]:
 
 def read_returns(path: Path, columns: Sequence[str] | None = None) -> RawCloud:
     """The points of a file that are returns, and the names of its fields."""
-    if require_file(path).stat().st_size > MAX_CLOUD_BYTES:
-        raise FileError(path, f"{path.stat().st_size} bytes is too large for one cloud")
+    if (size := require_file(file_of(path)).stat().st_size) > MAX_CLOUD_BYTES:
+        raise FileError(path, f"{size} bytes is too large for one cloud")
     if path.suffix.lower() not in _READERS:
         raise FileError(path, f"unknown cloud format; known are {', '.join(CLOUD_SUFFIXES)}")
     is_bin = path.suffix.lower() == ".bin"
@@ -619,6 +599,7 @@ _READERS: dict[str, Callable[[Path], RawCloud]] = {
     ".ply": read_ply, ".feather": lambda path: raw_cloud(path, *read_feather(path)),
 }  # fmt: skip
 CLOUD_SUFFIXES = tuple(_READERS)
+_READERS |= {suffix: lambda path: raw_cloud(path, *read_lidar(path)) for suffix in SUFFIXES}
 
 _COST = "the error bars become about twice as wide without; record it, or name its field intensity"
 """Measured on data/sample: 1.8 to 2.8 times the error bars without it, with half of the matches."""

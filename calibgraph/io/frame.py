@@ -6,7 +6,6 @@ import hashlib
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError, DatasetError
 from calibgraph.files import sha256
+from calibgraph.io.argoverse_lidars import file_of
 from calibgraph.io.bags import (
     MESSAGE_SUFFIX,
     hash_message,
@@ -327,14 +327,14 @@ class Frame:
         return found
 
     def hashes(self) -> dict[str, str]:
-        """SHA-256 of the cloud and the images, by path; computed once."""
-        return self.derive_for_all(("hashes", self.index), lambda: self._hashes)
-
-    @cached_property
-    def _hashes(self) -> dict[str, str]:
-        found = {path: hashlib.sha256(a.tobytes()).hexdigest() for path, a in self.arrays.items()}
+        """SHA-256 of the cloud and the images, by path; computed once if frames are kept."""
         paths = (self.cloud_path, *self.image_paths.values(), *self.lidar_paths.values())
-        return {str(path): found.get(path) or hash_source(path) for path in paths}
+
+        def compute() -> dict[str, str]:
+            known = {p: hashlib.sha256(a.tobytes()).hexdigest() for p, a in self.arrays.items()}
+            return {str(path): known.get(path) or hash_source(path) for path in paths}
+
+        return self.derive_for_all(("hashes", self.index), compute)
 
     def entry(self) -> dict[str, Any]:
         """The frame's number, files and motion if it is known, as a result keeps them."""
@@ -442,4 +442,4 @@ def frame_of_entry(entry: Mapping[str, Any]) -> Frame:
 
 def hash_source(path: Path) -> str:
     """SHA-256 of a file, or of a message in a bag."""
-    return hash_message(path) if path.suffix == MESSAGE_SUFFIX else sha256(path)
+    return hash_message(path) if path.suffix == MESSAGE_SUFFIX else sha256(file_of(path))

@@ -126,9 +126,19 @@ def unified_coefficients(xi: float, values: Sequence[float], path: Path | str) -
 
 
 def fitted_coefficients(
-    values: Sequence[float], model: LensModel, path: Path | str
+    values: Sequence[float], model: LensModel, path: Path | str, *, listed: bool = False
 ) -> tuple[float, ...]:
-    """Distortion coefficients in a number that the model has: zeros at the end come and go."""
+    """Distortion coefficients in a number that the model has: zeros at the end come and go.
+
+    ``listed`` are those of formats that list as many as OpenCV does.
+    """
+    fewest = min((count for count in COEFFICIENTS[model] if count), default=0)
+    if listed and 0 < len(values) < fewest:
+        raise FileError(
+            path,
+            f"{len(values)} distortion coefficients, the lens model {model} has {ORDERS[model]}; "
+            "add those that are missing, zero if they are",
+        )
     kept = tuple(float(value) for value in np.trim_zeros(np.array(values, dtype=float), "b"))
     if model == "pinhole" and not kept:
         return ()
@@ -140,20 +150,6 @@ def fitted_coefficients(
         f"{len(values)} distortion coefficients, {len(kept)} without zeros; the lens model "
         f"{model} here has {ORDERS[model]}",
     )
-
-
-def listed_coefficients(
-    values: Sequence[float], model: LensModel, path: Path | str
-) -> tuple[float, ...]:
-    """As :func:`fitted_coefficients`, of formats that list as many as OpenCV does."""
-    fewest = min((count for count in COEFFICIENTS[model] if count), default=0)
-    if 0 < len(values) < fewest:
-        raise FileError(
-            path,
-            f"{len(values)} distortion coefficients, the lens model {model} has {ORDERS[model]}; "
-            "add those that are missing, zero if they are",
-        )
-    return fitted_coefficients(values, model, path)
 
 
 def intrinsics_of_matrix(K: ArrayLike, where: Path | str) -> Intrinsics:

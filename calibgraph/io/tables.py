@@ -3,28 +3,19 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.arrays import Array
 from calibgraph.errors import CorrespondenceError, FileError
 from calibgraph.files import require_file
-from calibgraph.model.camera_matches import COLUMNS, FORMAT, NAMES, NUMBERS, PLANES, CameraMatches
-from calibgraph.model.correspondences import (
-    COORDINATES,
-    INFORMATION,
-    LATE,
-    TWIST,
-    Correspondences,
-    as_confidence,
-    check_schema,
-)
+from calibgraph.model.camera_matches import CameraMatches
+from calibgraph.model.correspondences import CAMERA_INDEX, Column, Correspondences, Table
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -34,6 +25,10 @@ _FEW_ROWS, _FEW_BYTES, _MOST_RATIO = 2**20, 2**26, 64
 """What any file may hold, and how many times its bytes otherwise: a row of five random coordinates
 takes 12 bytes and more, however packed."""
 _MOST_NAME_BYTES = 400  # 100 letters of 4 bytes
+_FORMER = "point_index"  # a column of earlier tables, which is not read
+_TEXT = ("string", "large_string", "string_view", "binary", "large_binary")
+
+AnyTable = TypeVar("AnyTable", bound=Table)
 
 
 def load_correspondences(path: Path | str) -> Correspondences:
@@ -42,30 +37,41 @@ def load_correspondences(path: Path | str) -> Correspondences:
     Raises:
         FileError: if the file is missing or truncated, lacks a column, or holds a wrong value.
     """
-    path = require_file(Path(path))
-    table = read_arrow(path)
-    if not len(table):
+    found = _load(Path(path), Correspondences)
+    if not len(found):
         raise FileError(path, "holds no rows; write the correspondences into it")
+    return found
+
+
+def load_camera_matches(path: Path | str) -> CameraMatches:
+    """Read a table as :func:`load_correspondences` does."""
+    return _load(Path(path), CameraMatches)
+
+
+def _load(path: Path, kind: type[AnyTable]) -> AnyTable:
+    arrow = _read_arrow(require_file(path), kind)
     try:
-        return from_arrow(table)
+        return _from_arrow(arrow, kind)
     except CorrespondenceError as error:
         raise FileError(path, str(error)) from error
 
 
-def read_arrow(
-    path: Path, names: Sequence[str] = ("camera",), types: Mapping[str, str] | None = None
-) -> pa.Table:
-    """A whole Parquet or CSV file, with any columns; in CSV ``names`` are texts."""
+def _read_arrow(path: Path, kind: type[Table]) -> pa.Table:
+    """A whole Parquet or CSV file, with any columns."""
     import pyarrow as pa
     from pyarrow import csv
 
+    cameras = kind.COLUMNS[CAMERA_INDEX].names
     with arrow_reads(path):
         if path.suffix == ".csv":
             _require_commas(path)
-            column_types = {**dict.fromkeys(names, pa.string()), **(types or {})}
-            options = csv.ConvertOptions(column_types=column_types)
-            return csv.read_csv(path, convert_options=options)
-        with open_parquet(path, names) as file:
+            types = {
+                name: pa.string() if name in cameras else pa.from_numpy_dtype(np.dtype(of.kind))
+                for of in kind.COLUMNS.values()
+                for name in of.names
+            }
+            return csv.read_csv(path, convert_options=csv.ConvertOptions(column_types=types))
+        with _open_parquet(path, cameras) as file:
             return file.read()
 
 
@@ -81,7 +87,7 @@ def _require_commas(path: Path) -> None:
             )  # fmt: skip
 
 
-def open_parquet(path: Path, names: Sequence[str] = ("camera",)) -> Any:
+def _open_parquet(path: Path, names: Sequence[str]) -> Any:
     """A Parquet file, its checksums verified; each value of the columns ``names`` is held once."""
     from pyarrow import parquet
 
@@ -122,121 +128,120 @@ def arrow_reads(path: Path) -> Iterator[None]:
 
 def from_arrow(table: pa.Table) -> Correspondences:
     """Build correspondences from an Arrow table that has the file format's columns."""
+    return _from_arrow(table, Correspondences)
+
+
+def _from_arrow(table: pa.Table, kind: type[AnyTable]) -> AnyTable:
     import pyarrow as pa
 
-    check_schema(table.schema)
+    _check_schema(table.schema, kind)
+    metadata, values = table.schema.metadata or {}, dict[str, Any]()
     try:
-        require_short_names(table["camera"])
-        # As plain strings: a dictionary may contain a null name.
-        names = table["camera"].cast(pa.string())
-        camera = table.column_names.index("camera")
-        return _from_plain_columns(table.set_column(camera, "camera", names))
+        for attribute, of in kind.COLUMNS.items():
+            if of.names[0] not in table.column_names:
+                continue
+            for name in of.names:
+                _require_full(table[name], name, of)
+            if attribute == CAMERA_INDEX:
+                stated = json.loads(metadata.get(b"cameras", b"null"))
+                values["cameras"], numbers = _encode(table.select(of.names), stated)
+            else:
+                numbers = np.stack([_numbers(table, name, of.kind) for name in of.names], axis=1)
+            values[attribute] = numbers.reshape(len(table), *of.of_row)
+        if "confidence" in kind.COLUMNS:
+            values.setdefault("confidence", np.ones(len(table), np.float32))
+        values["metadata"] = json.loads(metadata.get(b"matcher", b"{}"))
+        return kind(**values)
     except (ValueError, TypeError, RecursionError, pa.ArrowException) as error:
         message = f"a column or the metadata has the wrong type: {error}"
         raise CorrespondenceError(message) from error
 
 
-def require_short_names(column: pa.ChunkedArray) -> None:
-    """Check the names of a dictionary before each of its rows takes memory for one."""
+def _check_schema(schema: pa.Schema, kind: type[Table]) -> None:
+    """Check that a table has the columns and the format of the file, each of a right type."""
+    try:
+        names = [str(column.name) for column in schema]
+    except UnicodeDecodeError as error:
+        raise CorrespondenceError(f"a column's name is not UTF-8 ({error}); rename it") from error
+    known = {name: of for of in kind.COLUMNS.values() for name in of.names}
+    for of in kind.COLUMNS.values():
+        missing = [name for name in of.names if name not in names]
+        if missing and (of.required or len(missing) < len(of.names)):
+            raise CorrespondenceError(f"column {missing[0]!r} is missing; found {names}")
+    for name in names:
+        if name not in (*known, _FORMER):
+            raise CorrespondenceError(f"unknown column {name!r}; known are {', '.join(known)}")
+        if names.count(name) > 1:
+            raise CorrespondenceError(f"has the column {name!r} twice; keep one")
+    form = (schema.metadata or {}).get(b"format", kind.FORMAT.encode()).decode("utf-8", "replace")
+    if form != kind.FORMAT:
+        raise CorrespondenceError(f"has the format {form!r}, expected {kind.FORMAT!r}")
+    cameras = kind.COLUMNS[CAMERA_INDEX].names
+    for name in known.keys() & {*names}:
+        _check_type(schema.field(name), "text" if name in cameras else known[name].kind)
+
+
+def _check_type(field: pa.Field, kind: str) -> None:
+    """Check that a column has a plain type, whose size in memory is the size of the data.
+
+    A few bytes of run-end encoded values, for example, could expand to any number of rows.
+    """
+    from pyarrow import types
+
+    if types.is_null(field.type):
+        raise CorrespondenceError(f"column {field.name!r} is empty; fill in or drop it")
+    if kind == "text":
+        named = field.type.value_type if types.is_dictionary(field.type) else field.type
+        what, right = kind, str(named) in _TEXT or types.is_integer(named)
+    else:
+        what, right = "whole numbers", types.is_integer(field.type)
+        if kind.startswith("f"):
+            what, right = "numbers", right or types.is_floating(field.type)
+    if not right:
+        raise CorrespondenceError(f"column {field.name!r} must hold {what}, found {field.type}")
+
+
+def _require_full(column: pa.ChunkedArray, name: str, of: Column) -> None:
+    """Check that a column has a value in every row.
+
+    Before that, how long the names of a dictionary are: its rows would take memory for one each.
+    """
     import pyarrow as pa
     from pyarrow import compute
 
-    if not pa.types.is_dictionary(column.type):
-        return
-    for chunk in column.chunks:
+    is_coded = pa.types.is_dictionary(column.type)
+    for chunk in column.chunks if is_coded else ():
         longest = compute.max(compute.binary_length(chunk.dictionary)).as_py() or 0
         if longest > _MOST_NAME_BYTES:
             raise CorrespondenceError(
-                f"column 'camera' holds a name of {longest} bytes; give the names of the rig"
+                f"column {name!r} holds a name of {longest} bytes; give the names of the rig"
             )
+    column = column.cast(pa.string()) if is_coded else column  # a dictionary may hold a null
+    if column.null_count and not of.gaps:
+        row = column.is_null().to_pylist().index(True)
+        raise CorrespondenceError(f"column {name!r} is empty; fill in or drop it", row=row)
 
 
-def require_no_nulls(table: pa.Table, names: Iterable[str]) -> None:
-    """Check that columns have a value in every row."""
-    for name in names:
-        if table[name].null_count:
-            row = table[name].is_null().to_pylist().index(True)
-            raise CorrespondenceError(f"column {name!r} is empty; fill in or drop it", row=row)
-
-
-def _from_plain_columns(table: pa.Table) -> Correspondences:
+def _encode(
+    names: pa.Table, stated: Sequence[str] | None
+) -> tuple[tuple[str, ...], NDArray[np.int32]]:
+    """The cameras, those that are stated or in the order of the rows, and (n, k) their numbers."""
     import pyarrow as pa
 
-    require_no_nulls(table, table.column_names)
-
-    given = table.column_names
-    encoded = table["camera"].combine_chunks().dictionary_encode()
-    if isinstance(encoded, pa.ChunkedArray):
-        encoded = encoded.combine_chunks()
-    return Correspondences(
-        cameras=tuple(encoded.dictionary.to_pylist()),
-        camera_index=np.asarray(encoded.indices.to_numpy(zero_copy_only=False), dtype=np.int32),
-        frame=_whole(table, "frame"),
-        pixels_px=_stack(table, COORDINATES[:2]),
-        points_lidar_m=_stack(table, COORDINATES[2:]),
-        confidence=as_confidence(table["confidence"].to_numpy())
-        if "confidence" in given
-        else np.ones(len(table), np.float32),
-        information_px=_stack(table, INFORMATION) if INFORMATION[0] in given else None,
-        twist_per_s=_stack(table, TWIST) if TWIST[0] in given else None,
-        late_s=table[LATE].to_numpy().astype(np.float64) if LATE in given else None,
-        stamp_ns=_whole(table, "stamp_ns") if "stamp_ns" in given else None,
-        metadata=json.loads((table.schema.metadata or {}).get(b"matcher", b"{}")),
-    )
+    chunks = [chunk for column in names.columns for chunk in column.cast(pa.string()).chunks]
+    encoded = pa.chunked_array(chunks, pa.string()).combine_chunks().dictionary_encode()
+    found = encoded.dictionary.to_pylist()
+    cameras = tuple(stated or found)
+    number = np.array([cameras.index(name) for name in found], np.int32)
+    return cameras, number[encoded.indices.to_numpy()].reshape(names.num_columns, -1).T
 
 
-def _stack(table: pa.Table, names: Sequence[str]) -> Array:
-    return np.stack([table[name].to_numpy().astype(np.float64) for name in names], axis=1)
-
-
-def _whole(table: pa.Table, name: str) -> NDArray[np.int64]:
+def _numbers(table: pa.Table, name: str, kind: str) -> NDArray[Any]:
     values = table[name].to_numpy()
-    if values.dtype == np.uint64 and (values >= 2**63).any():
+    if values.dtype == np.uint64 and kind == "i8" and (values >= 2**63).any():
         raise CorrespondenceError(f"column {name!r} holds a number beyond 64 bits")
-    return np.asarray(values, dtype=np.int64)
-
-
-def load_camera_matches(path: Path | str) -> CameraMatches:
-    """Read a table from Parquet, or from CSV with the same columns.
-
-    Raises:
-        FileError: if the file is missing or truncated, lacks a column, or holds a wrong value.
-    """
-    path = require_file(Path(path))
-    types = {"frame": "int64"} | dict.fromkeys((*NUMBERS, *PLANES), "float64")
-    table = read_arrow(path, NAMES, types)
-    try:
-        return _from_arrow(table, path)
-    except (CorrespondenceError, ValueError, TypeError, LookupError, RecursionError) as error:
-        raise FileError(path, f"holds a wrong value: {error}") from error
-
-
-def _from_arrow(table: pa.Table, path: Path) -> CameraMatches:
-    given, metadata = table.column_names, table.schema.metadata or {}
-    if sorted(given) != sorted(COLUMNS):
-        missing = [name for name in COLUMNS if name not in given]
-        what = f"column {missing[0]!r} is missing" if missing else "there are unknown columns"
-        raise FileError(path, f"{what}; found {given}, expected {list(COLUMNS)}")
-    if (form := metadata.get(b"format", FORMAT.encode())) != FORMAT.encode():
-        raise FileError(path, f"has the format {form!r}, expected {FORMAT!r}")
-    require_no_nulls(table, (*NAMES, "frame", *NUMBERS))
-    for name in NAMES:
-        require_short_names(table[name])
-    names = [table[name].to_pylist() for name in NAMES]
-    stated = json.loads(metadata.get(b"cameras", b"null"))
-    in_order = [name for row in zip(*names, strict=True) for name in row]
-    cameras = tuple(stated or dict.fromkeys(in_order))
-    number = {name: index for index, name in enumerate(cameras)}
-    index = np.array([[number[name] for name in side] for side in names], np.int32).T
-
-    return CameraMatches(
-        cameras=cameras,
-        camera_index=index.reshape(-1, 2),
-        frame=np.asarray(table["frame"].to_numpy(), np.int64),
-        pixels_px=_stack(table, NUMBERS).reshape(-1, 2, 2),
-        planes_lidar_per_m=_stack(table, PLANES).reshape(-1, 2, 3),
-        metadata=json.loads(metadata.get(b"matcher", b"{}")),
-    )
+    with np.errstate(over="ignore"):  # becomes infinite, and is refused as such
+        return np.asarray(values.astype(kind))
 
 
 _PACKED = np.array([0x184D2204, 0xFD2FB528], np.uint32)

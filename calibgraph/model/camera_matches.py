@@ -11,18 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
-from calibgraph.errors import CorrespondenceError
-from calibgraph.model.correspondences import MAX_COORDINATE, Table
+from calibgraph.model.correspondences import CAMERA_INDEX, MAX_COORDINATE, Column, Table
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
 
-FORMAT = "calibgraph-camera-matches/1"
 NAMES = ("camera_a", "camera_b")
 NUMBERS = ("u_a_px", "v_a_px", "u_b_px", "v_b_px")
 PLANES = tuple(f"q{axis}_{side}_per_m" for side in "ab" for axis in "xyz")
-COLUMNS = (*NAMES, "frame", *NUMBERS, *PLANES)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -52,9 +49,13 @@ class CameraMatches(Table):
     planes_lidar_per_m: Array
     metadata: dict[str, Any] = field(default_factory=dict)
 
-    _SHAPES: ClassVar[Mapping[str, tuple[int, ...]]] = {
-        "camera_index": (2,), "frame": (), "pixels_px": (2, 2), "planes_lidar_per_m": (2, 3),
-    }  # fmt: skip
+    FORMAT: ClassVar[str] = "calibgraph-camera-matches/1"
+    COLUMNS: ClassVar[Mapping[str, Column]] = {
+        CAMERA_INDEX: Column(NAMES, "i4"),
+        "frame": Column(("frame",), "i8"),
+        "pixels_px": Column(NUMBERS, shape=(2, 2)),
+        "planes_lidar_per_m": Column(PLANES, shape=(2, 3), gaps=True),
+    }
 
     def __post_init__(self) -> None:
         self._check_shapes()
@@ -63,14 +64,9 @@ class CameraMatches(Table):
     @staticmethod
     def empty(cameras: Sequence[str], metadata: dict[str, Any] | None = None) -> CameraMatches:
         """A table without rows."""
-        return CameraMatches(
-            cameras=tuple(cameras),
-            camera_index=np.empty((0, 2), np.int32),
-            frame=np.empty(0, np.int64),
-            pixels_px=np.empty((0, 2, 2)),
-            planes_lidar_per_m=np.empty((0, 2, 3)),
-            metadata=metadata or {},
-        )
+        of = CameraMatches.COLUMNS.items()
+        columns: dict[str, Any] = {name: np.empty((0, *c.of_row), c.kind) for name, c in of}
+        return CameraMatches(cameras=tuple(cameras), metadata=metadata or {}, **columns)
 
     def __repr__(self) -> str:
         counts = ", ".join(f"{a}-{b}: {len(self.of_pair(a, b))}" for a, b in self.pairs())
@@ -92,20 +88,10 @@ class CameraMatches(Table):
         return np.flatnonzero((self.camera_index == wanted).all(axis=1))
 
     def to_arrow(self) -> pa.Table:
-        """The table in the file format's columns, its metadata in the schema."""
-        import pyarrow as pa
-
-        names = np.array([*self.cameras, ""], dtype=object)
-        columns: dict[str, Any] = {
-            name: pa.array(names[self.camera_index[:, side]], pa.string())
-            for side, name in enumerate(NAMES)
-        }
-        columns["frame"] = self.frame
-        columns |= dict(zip(NUMBERS, self.pixels_px.reshape(-1, 4).T, strict=True))
-        for name, column in zip(PLANES, self.planes_lidar_per_m.reshape(-1, 6).T, strict=True):
-            columns[name] = pa.array(column, from_pandas=True)  # a NaN becomes an empty cell
-        stated = {"cameras": json.dumps(self.cameras), "matcher": json.dumps(self.metadata)}
-        return pa.table(columns).replace_schema_metadata({"format": FORMAT, **stated})
+        """The table in the file format's columns; its metadata name cameras without a row, too."""
+        found = super().to_arrow()
+        names = {b"cameras": json.dumps(self.cameras)}
+        return found.replace_schema_metadata({**found.schema.metadata, **names})
 
     def _check_values(self) -> None:
         index, count = self.camera_index, len(self.cameras)
@@ -119,11 +105,6 @@ class CameraMatches(Table):
         good = np.all(there | np.isnan(planes).all(axis=2), axis=1)
         self._require(good, "planes_lidar_per_m", planes, "be finite and not zero, or NaN")
 
-    def _require(self, good: Any, what: str, found: Any, rule: str) -> None:
-        if not good.all():
-            row = int(np.flatnonzero(~good)[0])
-            raise CorrespondenceError(f"{what} must {rule}, found {found[row].tolist()}", row=row)
-
 
 def concatenate_camera_matches(tables: Iterable[CameraMatches]) -> CameraMatches:
     """Concatenate tables of the same cameras; the first gives the metadata.
@@ -134,5 +115,7 @@ def concatenate_camera_matches(tables: Iterable[CameraMatches]) -> CameraMatches
     given = list(tables)
     if len({table.cameras for table in given}) != 1:
         raise ValueError("expected tables of the same cameras")
-    columns = {name: np.concatenate([getattr(t, name) for t in given]) for name in given[0]._SHAPES}
+    columns = {
+        name: np.concatenate([getattr(t, name) for t in given]) for name in CameraMatches.COLUMNS
+    }
     return CameraMatches(cameras=given[0].cameras, metadata=given[0].metadata, **columns)

@@ -8,7 +8,7 @@ import logging
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,8 +22,6 @@ from calibgraph.model.places import KEYS, Places
 if TYPE_CHECKING:
     import pyarrow as pa
 
-TABLE_FORMAT = "calibgraph-correspondences/1"
-
 COORDINATES = ("u_px", "v_px", "x_m", "y_m", "z_m")
 INFORMATION = ("i_uu_px", "i_uv_px", "i_vv_px")
 TWIST = ("wx_rad_s", "wy_rad_s", "wz_rad_s", "vx_m_s", "vy_m_s", "vz_m_s")
@@ -33,12 +31,6 @@ MAX_TWIST = 6.0, 100.0  # rad/s and m/s: beyond those of a vehicle; swapped ones
 TWIST_RULE = "be under 6 rad/s, then under 100 m/s (rotation first, in radians)"
 
 MIN_INFORMATION, MAX_INFORMATION = 1e-12, 1e8  # 1/px^2: errors from 1e6 px down to 1e-4 px
-
-_WHOLE = ("frame", "stamp_ns")
-_REQUIRED = ("camera", "frame", *COORDINATES)
-_COLUMNS = (*_REQUIRED, "confidence", "stamp_ns", *INFORMATION, *TWIST, LATE)
-_FORMER = "point_index"  # a column of earlier tables, which is not read
-_TEXT = ("string", "large_string", "string_view", "binary", "large_binary")
 
 WITHOUT_METADATA = (
     "CSV holds no metadata, so that places, errors that frames share and what the images said "
@@ -50,19 +42,59 @@ _log = logging.getLogger(__name__)
 MAX_COORDINATE = 1e6  # px or m: far beyond any image and any LiDAR's range
 
 
+class Column(NamedTuple):
+    """A column of a table in memory, which a file has as one column for each number of a row.
+
+    Attributes:
+        names: of these; of an index of cameras, they hold the cameras' names.
+        kind: numpy's type of a number.
+        shape: of a row; () or that of the names if it is None.
+        required: whether a file must have it.
+        gaps: whether it may be empty where a number is NaN.
+    """
+
+    names: tuple[str, ...]
+    kind: str = "f8"
+    shape: tuple[int, ...] | None = None
+    required: bool = True
+    gaps: bool = False
+
+    @property
+    def of_row(self) -> tuple[int, ...]:
+        """The shape of a row."""
+        several = len(self.names) > 1
+        return (len(self.names),) * several if self.shape is None else self.shape
+
+
+CAMERA_INDEX = "camera_index"
+
+
 class Table:
     """Columns of equal length: what tables of points and of features have in common."""
 
-    _SHAPES: ClassVar[Mapping[str, tuple[int, ...]]]  # by column, of one row
+    FORMAT: ClassVar[str]
+    COLUMNS: ClassVar[Mapping[str, Column]]
+    """Of the file, in its order, by their attributes."""
+    cameras: tuple[str, ...]
+    camera_index: NDArray[np.int32]
     frame: NDArray[np.int64]
+    metadata: dict[str, Any]
 
     def _check_shapes(self) -> None:
-        for name, of_row in self._SHAPES.items():
-            column, shape = getattr(self, name), (len(self), *of_row)
+        for name, of in self.COLUMNS.items():
+            column, shape = getattr(self, name), (len(self), *of.of_row)
             if column is not None and column.shape != shape:
                 raise CorrespondenceError(
                     f"{name} has shape {column.shape}, expected {shape} like the column frame"
                 )
+
+    def _require(self, good: Any, what: str, found: NDArray[Any], rule: str) -> None:
+        if not good.all():
+            row = int(np.flatnonzero(~good)[0])
+            text = f"{what} must {rule}, found {found[row].tolist()}; drop or correct it"
+            error = MotionError if rule is TWIST_RULE else CorrespondenceError
+            camera = self.cameras[self.camera_index[row]] if self.camera_index.ndim == 1 else None
+            raise error(text, camera=camera, frame=int(self.frame[row]), row=row)
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -73,7 +105,7 @@ class Table:
         vars(kept).update(vars(self))
         if not isinstance(rows, slice) and rows.dtype == np.bool_:
             rows = np.flatnonzero(rows)
-        for name in self._SHAPES:
+        for name in self.COLUMNS:
             column = getattr(self, name)
             if column is not None:
                 some = column[rows] if isinstance(rows, slice) else column.take(rows, axis=0)
@@ -89,7 +121,20 @@ class Table:
 
     def to_arrow(self) -> pa.Table:
         """The table in the file format's columns, its metadata in the schema."""
-        raise NotImplementedError
+        import pyarrow as pa
+
+        names, columns = pa.array(self.cameras, pa.string()), {}
+        for attribute, of in self.COLUMNS.items():
+            values = getattr(self, attribute)
+            each = () if values is None else values.reshape(len(self), len(of.names)).T
+            for name, numbers in zip(of.names, each, strict=False):
+                column = pa.array(numbers, from_pandas=of.gaps)
+                is_index = attribute == CAMERA_INDEX
+                columns[name] = (
+                    pa.DictionaryArray.from_arrays(column, names) if is_index else column
+                )
+        metadata = {"format": self.FORMAT, "matcher": json.dumps(self.metadata)}
+        return pa.table(columns).replace_schema_metadata(metadata)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -133,10 +178,18 @@ class Correspondences(Table):
     findings: MatcherFindings = field(init=False)
     places: Places = field(init=False)
 
-    _SHAPES: ClassVar[Mapping[str, tuple[int, ...]]] = {
-        "camera_index": (), "frame": (), "pixels_px": (2,), "points_lidar_m": (3,),
-        "confidence": (), "information_px": (3,), "stamp_ns": (), "twist_per_s": (6,), "late_s": (),
-    }  # fmt: skip
+    FORMAT: ClassVar[str] = "calibgraph-correspondences/1"
+    COLUMNS: ClassVar[Mapping[str, Column]] = {
+        CAMERA_INDEX: Column(("camera",), "i4"),
+        "frame": Column(("frame",), "i8"),
+        "pixels_px": Column(COORDINATES[:2]),
+        "points_lidar_m": Column(COORDINATES[2:]),
+        "confidence": Column(("confidence",), "f4", required=False),
+        "stamp_ns": Column(("stamp_ns",), "i8", required=False),
+        "information_px": Column(INFORMATION, required=False),
+        TWISTS: Column(TWIST, required=False),
+        LATE: Column((LATE,), required=False),
+    }
 
     def __post_init__(self) -> None:
         self._check_shapes()
@@ -253,26 +306,6 @@ class Correspondences(Table):
         counts = np.bincount(self.camera_index, minlength=len(self.cameras))
         return dict(zip(self.cameras, counts.tolist(), strict=True))
 
-    def to_arrow(self) -> pa.Table:
-        """The table in the file format's columns, its metadata in the schema."""
-        import pyarrow as pa
-
-        columns: dict[str, Any] = {
-            "camera": pa.DictionaryArray.from_arrays(
-                self.camera_index, pa.array(self.cameras, pa.string())
-            ),
-            "frame": self.frame,
-            **dict(zip(COORDINATES[:2], self.pixels_px.T, strict=True)),
-            **dict(zip(COORDINATES[2:], self.points_lidar_m.T, strict=True)),
-            "confidence": self.confidence,
-        }
-        columns |= {} if self.stamp_ns is None else {"stamp_ns": self.stamp_ns}
-        for names, values in ((INFORMATION, self.information_px), (TWIST, self.twist_per_s)):
-            columns |= {} if values is None else dict(zip(names, values.T, strict=True))
-        columns |= {} if self.late_s is None else {LATE: self.late_s}
-        metadata = {"format": TABLE_FORMAT, "matcher": json.dumps(self.metadata)}
-        return pa.table(columns).replace_schema_metadata(metadata)
-
     def _check_values(self) -> None:
         for what, values in {"pixel": self.pixels_px, "point": self.points_lidar_m}.items():
             good = (np.abs(values) < MAX_COORDINATE).all(axis=1)
@@ -291,17 +324,13 @@ class Correspondences(Table):
             rule = "be positive semidefinite and not zero"
             self._require(is_information(i), "information", i, rule)
 
-    def _require(self, good: Any, what: str, found: NDArray[Any], rule: str) -> None:
-        if not good.all():
-            row = int(np.flatnonzero(~good)[0])
-            camera, frame = self.cameras[self.camera_index[row]], int(self.frame[row])
-            text = f"{what} must {rule}, found {found[row].tolist()}; drop or correct it"
-            error = MotionError if rule is TWIST_RULE else CorrespondenceError
-            raise error(text, camera=camera, frame=frame, row=row)
-
 
 def _optional(values: ArrayLike | None, dtype: type) -> Any:
     return None if values is None else np.asarray(values, dtype=dtype)
+
+
+_FILLED = {"information_px": (1.0, 0.0, 1.0), LATE: 0.0}
+"""What tables without it have beside others that have it; of other columns, then none has it."""
 
 
 def concatenate(tables: Sequence[Correspondences]) -> Correspondences:
@@ -313,27 +342,19 @@ def concatenate(tables: Sequence[Correspondences]) -> Correspondences:
     if not tables:
         raise ValueError("no tables to concatenate")
     names = tuple(sorted({name for table in tables for name in table.cameras}))
-    same = "frame", "pixels_px", "points_lidar_m", "confidence"
-    columns: dict[str, Any] = {n: np.concatenate([getattr(t, n) for t in tables]) for n in same}
-    pairs = [(np.array([names.index(n) for n in t.cameras], np.int32), t) for t in tables]
-    found = [number[t.camera_index] if len(t) else t.camera_index for number, t in pairs]
-    columns["camera_index"] = np.concatenate(found)
-    if any(table.information_px is not None for table in tables):
-        stated = [(table.information_px, len(table)) for table in tables]
-        parts = [np.tile([1.0, 0.0, 1.0], (n, 1)) if i is None else i for i, n in stated]
-        columns["information_px"] = np.concatenate(parts)
-    if any(table.late_s is not None for table in tables):
-        late = [np.zeros(len(t)) if t.late_s is None else t.late_s for t in tables]
-        columns[LATE] = np.concatenate(late)
-    for name in ("stamp_ns", "twist_per_s"):
-        given = [getattr(table, name) for table in tables if len(table)]
-        if given and all(column is not None for column in given):
-            columns[name] = np.concatenate(given)
+    parts, columns = [t for t in tables if len(t)] or [*tables[:1]], dict[str, Any]()
+    for name, of in Correspondences.COLUMNS.items():
+        given = [getattr(table, name) for table in parts]
+        if name in _FILLED and any(column is not None for column in given):
+            filled = (np.full((len(table), *of.of_row), _FILLED[name]) for table in parts)
+            given = [a if b is None else b for a, b in zip(filled, given, strict=True)]
+        columns[name] = None if any(c is None for c in given) else np.concatenate(given)
+    pairs = [(np.array([names.index(n) for n in t.cameras], np.int32), t) for t in parts]
+    numbers = [number[table.camera_index] for number, table in pairs]
     known = [table.metadata for table in tables if len(table) or table.metadata] or [{}]
     joined = tables[0].with_metadata(joined_metadata(known))
-    vars(joined).update(
-        {**dict.fromkeys(tables[0]._SHAPES), **columns, "cameras": names}
-    )  # as checked
+    columns |= {"cameras": names, CAMERA_INDEX: np.concatenate(numbers)}
+    vars(joined).update(columns)  # as checked
     return joined
 
 
@@ -383,56 +404,6 @@ def write_table(arrow: pa.Table, path: Path) -> None:
     said = (arrow.schema.metadata or {}).get(b"matcher", b"{}")
     if path.suffix == ".csv" and said != b"{}":
         _log.warning("%s: %s", path, WITHOUT_METADATA)
-
-
-def check_schema(schema: pa.Schema) -> None:
-    """Check that a table has the columns and the format of the file, each of a right type.
-
-    Raises:
-        CorrespondenceError: with the first thing that is wrong.
-    """
-    try:
-        types = [(column.name, str(column.type)) for column in schema]
-    except UnicodeDecodeError as error:
-        raise CorrespondenceError(f"a column's name is not UTF-8 ({error}); rename it") from error
-    names = [name for name, _ in types]
-    missing = [name for name in _REQUIRED if name not in names]
-    unknown = [name for name in names if name not in (*_COLUMNS, _FORMER)]
-    if missing:
-        raise CorrespondenceError(f"column {missing[0]!r} is missing; found {names}")
-    if unknown:
-        raise CorrespondenceError(f"unknown column {unknown[0]!r}; known are {', '.join(_COLUMNS)}")
-    if len(set(names)) < len(names):
-        raise CorrespondenceError(f"has a column twice: {names}; keep one")
-    for group in (INFORMATION, TWIST):
-        partial = [name for name in group if name in names]
-        if partial and len(partial) < len(group):
-            raise CorrespondenceError(f"has only {partial} of the columns {list(group)}")
-    form = (schema.metadata or {}).get(b"format", TABLE_FORMAT.encode()).decode("utf-8", "replace")
-    if form != TABLE_FORMAT:
-        raise CorrespondenceError(f"has the format {form!r}, expected {TABLE_FORMAT!r}")
-    for column in schema:
-        _check_type(column)
-
-
-def _check_type(field: pa.Field) -> None:
-    """Check that a column has a plain type, whose size in memory is the size of the data.
-
-    A few bytes of run-end encoded values, for example, could expand to any number of rows.
-    """
-    from pyarrow import types
-
-    if types.is_null(field.type):
-        raise CorrespondenceError(f"column {field.name!r} is empty; fill in or drop it")
-    if field.name == "camera":
-        named = field.type.value_type if types.is_dictionary(field.type) else field.type
-        kind, right = "text", str(named) in _TEXT or types.is_integer(named)
-    elif field.name in _WHOLE:
-        kind, right = "whole numbers", types.is_integer(field.type)
-    else:
-        kind, right = "numbers", types.is_integer(field.type) or types.is_floating(field.type)
-    if not right:
-        raise CorrespondenceError(f"column {field.name!r} must hold {kind}, found {field.type}")
 
 
 def as_confidence(values: ArrayLike) -> NDArray[np.float32]:

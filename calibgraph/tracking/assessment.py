@@ -14,7 +14,7 @@ from calibgraph.model.calibration import Calibration
 from calibgraph.model.geometry import invert, pair_covariances, pose_rows
 from calibgraph.model.summary import summarize
 from calibgraph.model.verdict import START, Check, Verdict
-from calibgraph.report.as_json import finite
+from calibgraph.stdout import finite
 from calibgraph.tracking.estimate import Estimate
 from calibgraph.tracking.events import Event
 from calibgraph.tracking.frames import StreamFrame
@@ -70,7 +70,7 @@ def _verdict(of: Verdicts, camera: int) -> Verdict:
     name, rows, absent = of.names[camera], pose_rows(camera), int(of.absent[camera])
     own = of.covariance[rows, rows]
     is_free = bool(np.isnan(own).any())
-    checks = check_estimate(
+    estimated = check_estimate(
         used=counts["used"],
         frames=int(of.frames[camera]),
         covariance=None if is_free else own,
@@ -79,6 +79,7 @@ def _verdict(of: Verdicts, camera: int) -> Verdict:
         scatter_only=not of.findings.states_common_error,
         tolerance=of.config.tolerance,
     )
+    checks = [*estimated]
     if repeated >= limit > absent - repeated:
         checks.append(stuck)
     elif absent >= limit:

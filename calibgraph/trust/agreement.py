@@ -23,7 +23,7 @@ from calibgraph.solver.matches import camera_block
 from calibgraph.solver.pair_refinement import PairFit
 from calibgraph.solver.pnp import RANSAC_ITERATIONS, frame_pose
 from calibgraph.solver.solution import Solution
-from calibgraph.trust.evidence import Checks, Evidence
+from calibgraph.trust.evidence import Evidence, Found
 from calibgraph.trust.thresholds import threshold
 
 ONE_POSE_DEG, ONE_POSE_CM = 0.1, 1.0
@@ -38,21 +38,19 @@ Apart = tuple[float, float, float]
 """Degrees and centimetres between two T_b_a; the largest difference along an axis in sigmas."""
 
 
-def pair_agreement_checks(evidence: Evidence) -> dict[str, list[Check]]:
+def pair_agreement_checks(evidence: Evidence) -> Found:
     """Whether the correspondences place the cameras relative to each other as the images do."""
     solution, alone = evidence.solution, evidence.solution.without_pairs()
     if solution.camera_matches is None or solution.alone is None or alone.mount is None:
-        return {}
+        return
     rig, covariance = solution.rig.moved_to(alone.mount.T_camera_lidar), alone.mount.covariance
     apart = {
         (fit.a, fit.b): pair_agreement(rig, fit, covariance)
         for fit in alone.pair_fits
         if evidence.fitted_blocks.keys() >= {fit.a, fit.b}
     }
-    return {
-        name: [check_agreement(pair, name, apart) for pair in apart if name in pair]
-        for name in evidence.cameras
-    }
+    for pair in apart:
+        yield from ((name, check_agreement(pair, name, apart)) for name in pair)
 
 
 def check_agreement(
@@ -91,13 +89,12 @@ def pair_agreement(rig: Rig, fit: PairFit, covariance: Array) -> Apart:
     return *pose_difference(fit.T_b_a, T_b_a), largest
 
 
-def one_pose_checks(evidence: Evidence) -> dict[str, list[Check]]:
+def one_pose_checks(evidence: Evidence) -> Found:
     """Cameras that end at one pose, unless the rig ties them there: have they one device's images?
 
     Nothing else in a result shows it: images have the pose of the device that took them.
     """
-    rig, checks = evidence.solution.rig, dict[str, list[Check]]()
-    T = evidence.solution.T_camera_lidar
+    rig, T = evidence.solution.rig, evidence.solution.T_camera_lidar
     tied = {frozenset((one.a, one.b)) for one in rig.relative_poses if _is_one_pose(one.T_a_b)}
     for a, b in combinations(T, 2):
         if not _is_one_pose(relative_transform(T[a], T[b])) or {a, b} in tied:
@@ -107,10 +104,8 @@ def one_pose_checks(evidence: Evidence) -> dict[str, list[Check]]:
             f"{a} and {b} end {degrees:.2g} deg, {centimetres:.2g} cm from each other: have they "
             "the images of one device? If they are mounted so, state it in relative_poses"
         )
-        for name in (a, b):
-            check = Check("cameras at one pose", "WARN", text, kind="one_pose")
-            checks.setdefault(name, []).append(check)
-    return checks
+        check = Check("cameras at one pose", "WARN", text, kind="one_pose")
+        yield from ((a, check), (b, check))
 
 
 def _is_one_pose(T_a_b: Array) -> bool:
@@ -122,10 +117,10 @@ _FEWEST_ITERATIONS = 50  # of MAGSAC, which also polishes its result
 _MISSED = 1e-6  # probability that no sample of a competing solution large enough to count is clean
 
 
-def competing_solution_checks(evidence: Evidence) -> Checks:
+def competing_solution_checks(evidence: Evidence) -> Found:
     """Whether the matches that a solution leaves out agree on another extrinsic."""
-    solution = evidence.solution.without_pairs()
-    return {name: [check_competing_solution(solution, name)] for name in evidence.fitted_blocks}
+    for name in evidence.fitted_blocks:
+        yield name, check_competing_solution(evidence.solution.without_pairs(), name)
 
 
 def check_competing_solution(solution: Solution, camera: str) -> Check:
@@ -161,16 +156,16 @@ def _ransac_iterations(fewest: float, matches: int) -> int:
     return int(min(max(needed, _FEWEST_ITERATIONS), RANSAC_ITERATIONS))
 
 
-def place_checks(evidence: Evidence) -> Checks:
+def place_checks(evidence: Evidence) -> Found:
     """Whether any place contradicts the others, where there are enough to tell which.
 
     Of the place that agrees least, by its distance: that of the camera or of the cloud there from
     where they are elsewhere; and by its inliers: the share of the matches within the gate over its
     median at the other places.
     """
-    errors, checks = evidence.solution.error_fit, dict[str, list[Check]]()
+    errors = evidence.solution.error_fit
     if errors is None or len(errors.model.frames) < error_components().robust_places:
-        return {}
+        return
     cameras, of_place = tuple(errors.model.cameras), errors.linear.distances
     frames = errors.model.frames
     for name in errors.model.blocks:
@@ -188,12 +183,9 @@ def place_checks(evidence: Evidence) -> Checks:
             ("place_distance", distances, int(np.argmax(distances))),
             ("place_inliers", shares / others, int(np.argmin(shares / others))),
         )
-        checks[name] = []
         for key, values, at in worst:
             row, value, place = threshold(key), float(values[at]), int(seen[at])
             first, last = int(frames[place][0]), int(frames[place][-1])
             which = f"frame {first}" if first == last else f"frames {first} to {last}"
             number = f"{value:.2g} {row.unit}".rstrip()
-            text = f"{row.name}: {number} at place {place + 1} ({which})"
-            checks[name].append(row.check(value, text))
-    return checks
+            yield name, row.check(value, f"{row.name}: {number} at place {place + 1} ({which})")

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import chain
 
 import numpy as np
 
@@ -21,8 +22,10 @@ from calibgraph.trust.pose_posterior import PosePosterior, group_tied, measure_p
 from calibgraph.trust.probability import probability_beyond
 from factors import pose_sigmas
 
+Found = Iterator[tuple[str, Check]]
+"""Checks, each with its camera."""
 Checks = Mapping[str, Sequence[Check]]
-"""Per camera, its checks; a camera without any may be left out."""
+"""Per camera, its checks."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,16 +160,15 @@ def gather_of_run(run: MatchingRun, *, asks_guess: bool = False) -> Evidence:
     return replace(evidence, posteriors=posteriors)
 
 
-def grade_by_images(run: MatchingRun, checks: Checks) -> Checks:
-    """Checks on images, without a FAIL where those of the run's matcher WARN at most."""
-    if run.matcher.image_checks_can_fail:
-        return checks
-    return {
-        name: [replace(c, status="WARN") if c.status == "FAIL" else c for c in of_camera]
-        for name, of_camera in checks.items()
-    }
+def grade_by_images(run: MatchingRun, check: Check) -> Check:
+    """A check on images, not a FAIL where those of the run's matcher WARN at most."""
+    warns = check.status == "FAIL" and not run.matcher.image_checks_can_fail
+    return replace(check, status="WARN") if warns else check
 
 
-def concatenate(parts: Sequence[Checks], cameras: Sequence[str]) -> dict[str, list[Check]]:
+def by_camera(cameras: Iterable[str], *parts: Found) -> dict[str, list[Check]]:
     """Per camera the checks of all parts, one part after the other."""
-    return {name: [check for part in parts for check in part.get(name, ())] for name in cameras}
+    checks: dict[str, list[Check]] = {name: [] for name in cameras}
+    for name, check in chain(*parts):
+        checks[name].append(check)
+    return checks

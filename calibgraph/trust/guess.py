@@ -11,19 +11,18 @@ from scipy.spatial.transform import Rotation
 
 from calibgraph.arrays import Array
 from calibgraph.model.geometry import invert, pose_difference, transform
-from calibgraph.model.verdict import Check
 from calibgraph.trust.conventions import convention_error_between, difference, in_words
-from calibgraph.trust.evidence import Checks, Evidence
+from calibgraph.trust.evidence import Evidence, Found
 from calibgraph.trust.thresholds import GUESS_TURNED_DEG, SWAP_SLACK, threshold
 
 
-def guess_checks(evidence: Evidence) -> Checks:
+def guess_checks(evidence: Evidence) -> Found:
     """Whether a result is so far from its guess that the guess follows another convention.
 
     A result may lie as far away as its matcher searches. One that is turned farther counts where a
     convention error of the guess explains it.
     """
-    findings, row, checks = evidence.findings, threshold("guess_translation"), {}
+    findings, row = evidence.findings, threshold("guess_translation")
     range_deg, range_m = (
         math.sqrt(3) * (reach or 0.0)
         for reach in (findings.range_rotation_deg, findings.range_translation_m)
@@ -39,18 +38,15 @@ def guess_checks(evidence: Evidence) -> Checks:
         if words and check.status == "PASS":
             text = f"{check.text} and {degrees:.3g} deg: {words}"
             check = replace(check, status="WARN", text=text)
-        checks[name] = [check]
-    return checks
+        yield name, check
 
 
-def swap_checks(evidence: Evidence) -> Checks:
+def swap_checks(evidence: Evidence) -> Found:
     """Whether a camera ended where another one's guess is; of those that have been found."""
     return compare_with_other_guesses(evidence.guess.T_camera_lidar, evidence.found)
 
 
-def compare_with_other_guesses(
-    guesses: Mapping[str, Array], results: Mapping[str, Array]
-) -> dict[str, list[Check]]:
+def compare_with_other_guesses(guesses: Mapping[str, Array], results: Mapping[str, Array]) -> Found:
     """The distance of two cameras to each other's guess over that to their own, at the least.
 
     With Gaussian errors of the guesses, of unknown size, the likelihood ratio of a swap is the
@@ -59,9 +55,9 @@ def compare_with_other_guesses(
 
     A check per result, by (4, 4) T_camera_lidar; none for a single camera.
     """
-    names, row, checks = [*guesses], threshold("swapped_cameras"), dict[str, list[Check]]()
+    names, row = [*guesses], threshold("swapped_cameras")
     if len(names) == 1 or not results:
-        return checks
+        return
     squared = np.full((len(names), len(names)), np.nan)  # from a guess to a result, if there is one
     found = [name in results for name in names]
     ended = np.array([results[name] for name in names if name in results])
@@ -77,17 +73,15 @@ def compare_with_other_guesses(
         of = ratios[:, names.index(name)]
         other = names[int(of.argmin())]
         what = f"distance of this camera and {other} to each other's guess over that to their own"
-        checks[name] = [row.check(float(of.min()), name=what)]
-    return checks
+        yield name, row.check(float(of.min()), name=what)
 
 
-def point_distance_checks(evidence: Evidence) -> Checks:
+def point_distance_checks(evidence: Evidence) -> Found:
     """Whether the points can be in metres."""
-    checks, row = {}, threshold("point_distance")
+    row = threshold("point_distance")
     for name, block in evidence.solution.objective.blocks.items():
         x, y, z = block.block.points_lidar_m.T  # which need not be contiguous
-        checks[name] = [row.check(float(np.median(np.sqrt(x * x + y * y + z * z))))]
-    return checks
+        yield name, row.check(float(np.median(np.sqrt(x * x + y * y + z * z))))
 
 
 _FRAME_M, _ALIKE_DEG, _ALIKE_CM = 1.0, 5.0, 50.0

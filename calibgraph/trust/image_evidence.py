@@ -11,8 +11,8 @@ Per camera, with the scores of :mod:`calibgraph.matching.structure.shift_scores`
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -43,7 +43,7 @@ from calibgraph.parallel import Threads, core_pool
 from calibgraph.progress import Progress, no_progress
 from calibgraph.solver.columns import ColumnFit, apply_twist, block_of, fit_columns
 from calibgraph.solver.lens import MATCH_SHARE
-from calibgraph.trust.evidence import Checks, grade_by_images
+from calibgraph.trust.evidence import Found, grade_by_images
 from calibgraph.trust.lens_parameter import (
     IMAGES,
     NAMES,
@@ -63,78 +63,67 @@ MIN_GROUPS = 30  # fewer groups of windows are no evidence
 PAIR_LEVEL = replace(WIDE, reach_rad=np.radians(1.2))
 
 
-@dataclass(frozen=True)
-class ImageEvidence:
-    """Image evidence on one camera's result.
-
-    Attributes:
-        groups: groups of windows that were scored; with fewer than MIN_GROUPS all else is NaN.
-        lens: how the lens that fits best differs; none where images do not determine it.
-        displaced_z_score: score at the result less the mean score of the displaced poses, in
-            standard deviations of the latter.
-        frames_best: share of the frames whose score is highest at the result.
-        frames_lost: the numbers of the other frames.
-        pair_offset: by how many frames the clouds that fit the images best are later: -1, 0 or 1.
-        pair_margin: lead of the score with the own clouds over the better of the two neighbours',
-            as a share of the best; negative if a neighbour is better, NaN without neighbours.
-    """
-
-    groups: int
-    lens: tuple[LensParameter, ...] = ()
-    displaced_z_score: float = math.nan
-    frames_best: float = math.nan
-    frames_lost: tuple[int, ...] = ()
-    pair_offset: int = 0
-    pair_margin: float = math.nan
-
-
-def measure_image_evidence(
+def check_images(  # noqa: PLR0913 - what is checked, and by what
     dataset: Dataset,
     rig: Rig,
     *,
+    tolerance: tuple[float, float] = TOLERANCE,
     places: Places = NOWHERE,
     seed: int = 0,
-    extrinsics_only: bool = False,
+    lens: bool = True,
+    pairing: bool = True,
     progress: Progress | None = None,
-) -> dict[str, ImageEvidence]:
-    """Measure the image evidence on all cameras of a result."""
-    report = progress or no_progress
+) -> list[tuple[str, Check]]:
+    """The checks of all cameras of a result: of the extrinsic, if asked of lens and pairing.
+
+    At a wrong extrinsic the lens cannot be measured.
+    """
+    report, found = progress or no_progress, []
     frames = spread_out(dataset.frames, MAX_FRAMES)
-    evidence = {}
+    names = {frame.index: frame.name for frame in frames}
     with core_pool() as cores, Threads(len(rig.cameras)) as pool:
         scorer = FrameScorer(dataset, frames, cores)
 
-        def measure(name: str, camera: Camera) -> ImageEvidence:
+        def check(name: str, camera: Camera) -> list[Check]:
             images = scorer.load_images(name, camera)
             each = scorer.score(images, camera, WIDE)
             scores = concatenate_scores([one for one in each if one is not None])
-            if len(scores.weights) < MIN_GROUPS:
-                return ImageEvidence(len(scores.weights))
+            if (groups := len(scores.weights)) < MIN_GROUPS:
+                text = (
+                    f"the images could not be checked: only {groups} places with structure in both "
+                    "image and cloud"
+                )
+                return [Check("image evidence", "WARN", text, groups)]
             numbers, per_frame = score_displaced(scores)  # over the same windows
             best = per_frame[:, 0] > per_frame[:, 1:].max(axis=1)
-            found = ImageEvidence(
-                len(scores.weights),
-                displaced_z_score=displaced_z_score(per_frame),
-                frames_best=float(best.mean()),
-                frames_lost=tuple(numbers[~best].tolist()),
-            )
-            if extrinsics_only:
-                return found
-            lens = measure_lens(scorer, images, camera, scores, seed=seed, places=places)
-            offset, margin = _compare_with_neighbours(scorer, images, camera, each)
-            return replace(found, lens=lens, pair_offset=offset, pair_margin=margin)
+            displaced = displaced_z_score(per_frame)
+            lost, row = ", ".join(names[n] for n in numbers[~best][:5]), threshold("frames_best")
+            checks = [
+                threshold("displaced_z_score").check(displaced),
+                # A solve leaves out frames that fit another extrinsic, and the rest agrees.
+                row.check(best.mean(), advice=f"{lost} fit another extrinsic better: {row.advice}"),
+            ]
+            is_near = displaced >= LENS_Z_SCORE and best.mean() > LENS_FRAMES_BEST
+            if lens and is_near:
+                measured = measure_lens(scorer, images, camera, scores, seed=seed, places=places)
+                checks += [check_parameter(one, IMAGES, tolerance) for one in measured]
+            return checks + (_check_pairing(scorer, images, camera, each) if pairing else [])
 
-        measured = pool.map(measure, rig.cameras, rig.cameras.values())
+        checked = pool.map(check, rig.cameras, rig.cameras.values())
         for index, name in enumerate(rig.cameras):
             report(f"checking: {name}", index, len(rig.cameras))
-            evidence[name] = next(measured)
-    return evidence
+            found += [(name, each) for each in next(checked)]
+    return found
 
 
-def _compare_with_neighbours(
+def _check_pairing(
     scorer: FrameScorer, images: Images, camera: Camera, wide: Sequence[ShiftScores | None]
-) -> tuple[int, float]:
-    """Offset and margin of each image's agreement with its own cloud, at ``WIDE``, and others'."""
+) -> list[Check]:
+    """Whether each image agrees with its own cloud, at ``WIDE``, better than with the neighbours'.
+
+    The value is the lead of its score over that with the better ones, as a share of the best. Of
+    frames without neighbours there is no check.
+    """
     before, after = (scorer.score(images, camera, PAIR_LEVEL, offset=offset) for offset in (-1, 1))
     own = [one and crop_grids(one, camera, PAIR_LEVEL) for one in wide]
     values = np.array([  # (3, frames) z-scores at the result; NaN where there is no such cloud
@@ -143,14 +132,18 @@ def _compare_with_neighbours(
     ])  # fmt: skip
     comparable = np.isfinite(values[1]) & np.isfinite(values[[0, 2]]).any(axis=0)
     if not comparable.any():
-        return 0, math.nan
+        return []
     before_z, own_z, after_z = values[:, comparable]
     margins = [own_z - before_z, own_z - after_z]
     worse = int(np.argmin([np.nanmean(m) if np.isfinite(m).any() else np.inf for m in margins]))
     there = np.isfinite(margins[worse])
     own_sum, other = own_z[there].sum(), (before_z, after_z)[worse][there].sum()
-    margin = float((own_sum - other) / (max(abs(own_sum), abs(other)) + 1e-12))
-    return 0 if own_sum >= other else (-1, 1)[worse], margin
+    advice = (
+        f"the images fit the clouds of the {('previous', 'next')[worse]} frame better; check which "
+        "image belongs to which cloud, and their time stamps"
+    )
+    margin = (own_sum - other) / (max(abs(own_sum), abs(other)) + 1e-12)
+    return [threshold("own_clouds").check(margin, advice=advice)]
 
 
 SEARCH_POSE = np.array([WIDE.rotation_rad] * 3 + [0.5] * 3)
@@ -252,7 +245,7 @@ def _fit_at_peaks(
     )
 
 
-def image_checks(run: MatchingRun) -> Checks:
+def image_checks(run: MatchingRun) -> Found:
     """Whether the images agree with a result; nothing if there is no time left for them.
 
     They are scored as by the matcher ``structure``, which does not use all that other matchers use:
@@ -266,57 +259,14 @@ def image_checks(run: MatchingRun) -> Checks:
     solved = run.solution.without_pairs().solved_rig.cameras
     cameras = {name: of for name, of in solved.items() if name not in table.findings.missed}
     if run.out_of_time or not cameras:
-        return {}
+        return
     try:
-        evidence = measure_image_evidence(
-            run.dataset, Rig(cameras=cameras), places=table.places, seed=config.seed,
-            progress=run.progress,
+        found = check_images(
+            run.dataset, Rig(cameras=cameras), tolerance=config.tolerance, places=table.places,
+            seed=config.seed, lens=not table.is_swept, progress=run.progress,
         )  # fmt: skip
     except (CalibrationError, OSError) as error:  # files that its matcher did not need
-        text = f"the images could not be checked: {error}"
-        return {name: [Check("image evidence", "WARN", text)] for name in solved}
-    names = {frame.index: frame.name for frame in run.dataset.frames}
-    checks = dict[str, tuple[Check, ...]]()
-    for name, found in evidence.items():
-        seen = replace(found, lens=()) if table.is_swept else found
-        checks[name] = *evidence_checks(seen, names, config.tolerance), *pairing_checks(seen)
-    return grade_by_images(run, checks)
-
-
-def evidence_checks(
-    found: ImageEvidence, names: Mapping[int, str], tolerance: tuple[float, float] = TOLERANCE
-) -> tuple[Check, ...]:
-    """The checks of one camera's extrinsic and lens by the image evidence."""
-    if math.isnan(found.displaced_z_score):
-        text = (
-            f"the images could not be checked: only {found.groups} places with structure in both "
-            "image and cloud"
-        )
-        return (Check("image evidence", "WARN", text, found.groups),)
-    displaced = threshold("displaced_z_score").check(found.displaced_z_score)
-    of_pose = displaced, frames_check(found, names)
-    mispaired = found.frames_best <= LENS_FRAMES_BEST
-    if found.displaced_z_score < LENS_Z_SCORE or mispaired:
-        return of_pose  # at a wrong extrinsic the lens cannot be measured
-    return *of_pose, *(check_parameter(each, IMAGES, tolerance) for each in found.lens)
-
-
-def frames_check(found: ImageEvidence, names: Mapping[int, str]) -> Check:
-    """Whether the frames of a camera fit one extrinsic: something may have moved meanwhile.
-
-    A solve leaves such frames out, and the rest agrees.
-    """
-    row, lost = threshold("frames_best"), ", ".join(names[n] for n in found.frames_lost[:5])
-    return row.check(found.frames_best, advice=f"{lost} fit another extrinsic better: {row.advice}")
-
-
-def pairing_checks(found: ImageEvidence) -> tuple[Check, ...]:
-    """Whether images and clouds belong together; nothing without neighbouring frames."""
-    if math.isnan(found.pair_margin):
-        return ()
-    side = "next" if found.pair_offset > 0 else "previous"
-    advice = (
-        f"the images fit the clouds of the {side} frame better; check which image belongs to "
-        "which cloud, and their time stamps"
-    )
-    return (threshold("own_clouds").check(found.pair_margin, advice=advice),)
+        check = Check("image evidence", "WARN", f"the images could not be checked: {error}")
+        found = [(name, check) for name in solved]
+    for name, check in found:
+        yield name, grade_by_images(run, check)

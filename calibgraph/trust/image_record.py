@@ -10,7 +10,6 @@ the lens and the clock that they were made for. A camera of which none are taken
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -42,20 +41,6 @@ class _Seen(BaseModel):
     causes: tuple[Check, ...] = ()
     checks: tuple[Check, ...] = ()
     posterior: PosePosterior | None = None
-
-
-@dataclass(frozen=True)
-class RunChecks:
-    """The checks of a run, by what they need: a table, or its images, clouds and rounds.
-
-    ``causes`` explain the failure of others; ``unseen`` cameras have images that were not looked
-    at.
-    """
-
-    of_solution: Checks
-    of_run: Checks = field(default_factory=dict)
-    causes: Checks = field(default_factory=dict)
-    unseen: Collection[str] = ()
 
 
 class ImageRecord(BaseModel):
@@ -92,18 +77,20 @@ class ImageRecord(BaseModel):
             if name not in solution.held and of.posterior and _same_lens(of.camera, camera)
         }
 
-    def checks(self, evidence: Evidence, of_solution: Checks) -> RunChecks:
-        """Those of a solution of the table, with what was recorded of the cameras as they are."""
+    def join(self, evidence: Evidence, of_solution: Checks) -> tuple[Checks, Collection[str]]:
+        """Checks of a solution of the table, with what was recorded of the cameras as they are.
+
+        And the cameras of which nothing was.
+        """
         if not self.cameras and not self.joined:
-            return RunChecks(of_solution, unseen=evidence.cameras)
-        other = {name: self._compare(evidence, name) for name in evidence.cameras}
-        seen = {name: self.cameras[name] for name, check in other.items() if check is None}
+            return of_solution, evidence.cameras
         same = evidence.solution.config.tolerance == self.tolerance
-        wider = [] if same else [_not_compared(self._judged)]
-        of_run = {name: [*of.checks, *wider] for name, of in seen.items()}
-        told = {name: [check] for name, check in other.items() if check is not None}
-        causes = {name: of.causes for name, of in seen.items()}
-        return RunChecks(of_solution, {**of_run, **told}, causes, [*told])
+        narrower = [] if same else [_not_compared(self._judged)]
+        other = {name: self._compare(evidence, name) for name in evidence.cameras}
+        unseen = {name: [*of_solution[name], each] for name, each in other.items() if each}
+        seen = {name: self.cameras[name] for name in other.keys() - unseen.keys()}
+        joined = {n: [*of.causes, *of_solution[n], *of.checks, *narrower] for n, of in seen.items()}
+        return joined | unseen, unseen
 
     @property
     def _judged(self) -> str:
@@ -146,14 +133,14 @@ class ImageRecord(BaseModel):
         return _not_compared(why) if why else None
 
 
-def to_metadata(evidence: Evidence, checks: RunChecks) -> dict[str, Any]:
-    """The record of a run, as a key of its table's metadata."""
+def to_metadata(evidence: Evidence, causes: Checks, checks: Checks) -> dict[str, Any]:
+    """The record of a run, by its own checks and the causes, as a key of its table's metadata."""
     cameras = evidence.solution.solved_rig.cameras
     seen = {
         name: _Seen.model_construct(
             camera=cameras[name].model_copy(update={"covariance": None}),
-            causes=tuple(checks.causes.get(name, ())),
-            checks=tuple(checks.of_run.get(name, ())),
+            causes=tuple(causes[name]),
+            checks=tuple(checks[name]),
             posterior=evidence.posteriors.get(name),
         )
         for name in evidence.cameras

@@ -10,6 +10,7 @@ A constant motion straight ahead is equivalent to a camera that is mounted furth
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
 
@@ -23,14 +24,13 @@ from calibgraph.io.frame import seconds_between
 from calibgraph.matching.run import MatchingRun, with_motion
 from calibgraph.model.clock import clock_of
 from calibgraph.model.correspondences import Correspondences
-from calibgraph.model.findings import MatcherFindings
 from calibgraph.model.lens import LensSigmas
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.model.verdict import TOLERANCE, Check
 from calibgraph.parallel import map_on_cores
 from calibgraph.solver.columns import block_of, fit_columns
 from calibgraph.solver.lens import MATCH_SHARE
-from calibgraph.trust.evidence import Checks, Evidence, grade_by_images
+from calibgraph.trust.evidence import Evidence, Found, grade_by_images
 from calibgraph.trust.inputs import INTERVAL_S, MAX_FRAMES, registered_twists
 from calibgraph.trust.lens_parameter import (
     IMAGES,
@@ -49,14 +49,14 @@ MIN_FRAMES = 4  # with fewer, a single frame decides
 _TOLD_S, _TOLD_CM = 0.01, 0.1  # whose effect is told, if it has one
 
 
-def offset_checks(evidence: Evidence) -> Checks:
+def offset_checks(evidence: Evidence) -> Found:
     """The offset of each camera by the matches of a table that comes with the LiDAR's motion."""
-    solution = evidence.solution
-    table, rig = solution.correspondences, solution.solved_rig
-    if table.twist_per_s is None or not {*CLOCK}.isdisjoint(solution.config.estimate):
-        return {}
-    fits = _fit_cameras(rig, table, evidence.findings)
-    return {n: [check_offset(fit, RESIDUALS, solution.config.tolerance)] for n, fit in fits}
+    solution, config = evidence.solution, evidence.solution.config
+    if not {*CLOCK}.isdisjoint(config.estimate):
+        return
+    table, variance = solution.correspondences, evidence.findings.place_variance
+    for name, fit in _fit_cameras(solution.solved_rig, table, variance):
+        yield name, check_offset(fit, RESIDUALS, config.tolerance)
 
 
 def asks_offset(run: MatchingRun) -> bool:
@@ -65,20 +65,19 @@ def asks_offset(run: MatchingRun) -> bool:
     return bool(run.matcher.tracking_rounds) and not (run.out_of_time or is_free)
 
 
-def image_offset_checks(run: MatchingRun) -> Checks:
+def image_offset_checks(run: MatchingRun) -> Found:
     """The offset of each camera by matches that are made for it, unless it is estimated.
 
     By a matcher made for them, since that of the run has been released.
     """
-    config = run.solution.config
     if not asks_offset(run) or run.correspondences.is_swept:
-        return {}
+        return
     rig, moved, registered = run.solution.without_pairs().solved_rig, None, False
     with suppress(CalibrationError, OSError):  # the checks on images report it
         moved, registered = _with_known_motion(run.dataset)
     matcher = run.matcher.with_estimate(("offset",))
     if moved is None or matcher is run.matcher:
-        return {}
+        return
     if registered:  # the result leaves out times where the motion is not known
         none = dict.fromkeys(("time_offset_s", "time_offset_sigma_s", "readout_s"))
         cameras = {name: each.model_copy(update=none) for name, each in rig.cameras.items()}
@@ -88,13 +87,12 @@ def image_offset_checks(run: MatchingRun) -> Checks:
     )
     matcher.release()
     table = with_motion(table, moved).with_places(run.correspondences.places)
-    fits = _fit_cameras(rig, table, run.correspondences.findings)
-    options = _motion_options(run.dataset) if registered else ""
-    checks = {n: [check_offset(fit, IMAGES, config.tolerance, options)] for n, fit in fits}
-    if registered and seconds_between(*moved.frames[:2]) is None:
-        taken = f"; successive clouds are taken to be {INTERVAL_S:g} s apart"
-        checks = {n: [replace(c, text=c.text + taken) for c in of] for n, of in checks.items()}
-    return grade_by_images(run, checks)
+    options, tolerance = _motion_options(run.dataset) * registered, run.solution.config.tolerance
+    is_told = registered and seconds_between(*moved.frames[:2]) is None
+    taken = f"; successive clouds are taken to be {INTERVAL_S:g} s apart" * is_told
+    for name, fit in _fit_cameras(rig, table, run.correspondences.findings.place_variance):
+        check = check_offset(fit, IMAGES, tolerance, options)
+        yield name, grade_by_images(run, replace(check, text=check.text + taken))
 
 
 def _motion_options(dataset: Dataset) -> str:
@@ -108,11 +106,11 @@ def _motion_options(dataset: Dataset) -> str:
 
 
 def _fit_cameras(
-    rig: Rig, table: Correspondences, findings: MatcherFindings
-) -> list[tuple[str, LensParameter]]:
-    rows = ((name, camera, table.of_camera(name)) for name, camera in rig.cameras.items())
-    fits = ((n, fit_offset(camera, own, findings.place_variance)) for n, camera, own in rows)
-    return [(name, fit) for name, fit in fits if fit is not None]
+    rig: Rig, table: Correspondences, place_variance: float
+) -> Iterator[tuple[str, LensParameter]]:
+    for name, camera in rig.cameras.items():
+        if fit := fit_offset(camera, table.of_camera(name), place_variance):
+            yield name, fit
 
 
 def check_offset(
@@ -170,7 +168,7 @@ _BY_SCENE = "focal length", "distortion"  # what they do to the pose differs bet
 _MAX_MATCHES = 20_000  # evenly chosen: bounds the time
 
 
-def intrinsics_checks(evidence: Evidence) -> Checks:
+def intrinsics_checks(evidence: Evidence) -> Found:
     """Whether wrong intrinsics explain the residuals.
 
     By all matches, not only those within the gate. The variance of what the frames of a place share
@@ -179,7 +177,7 @@ def intrinsics_checks(evidence: Evidence) -> Checks:
     is_swept = evidence.solution.correspondences.is_swept  # which looks like a lens
     names = [] if is_swept else [*evidence.fitted_blocks]
     checks = map_on_cores(lambda name: _check_camera(evidence, name), names)
-    return dict(zip(names, checks, strict=True))
+    yield from ((name, each) for name, of in zip(names, checks, strict=True) for each in of)
 
 
 def _check_camera(evidence: Evidence, name: str) -> list[Check]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from functools import cached_property
@@ -23,7 +23,7 @@ from calibgraph.graph.lens import LensVariable
 from calibgraph.model.config import LensPart
 from calibgraph.model.lens import LensSigmas
 from calibgraph.model.rig import Camera
-from calibgraph.model.verdict import FAIL_ABOVE, PASS_BELOW, TOLERANCE, Check, Status
+from calibgraph.model.verdict import TOLERANCE, Check
 from calibgraph.solver.columns import Marginal
 from calibgraph.trust.thresholds import LENS_WRONG, LENS_WRONG_SHARE, threshold
 from factors import Columns
@@ -130,31 +130,28 @@ class LensParameter:
             return 0.0
         return self._log_density(LENS_WRONG) - self._log_density(0.0)
 
-    def probability(self, tolerance: tuple[float, float] = TOLERANCE, blame: float = 1.0) -> float:
+    def probability(
+        self,
+        tolerance: tuple[float, float] = TOLERANCE,
+        *,
+        blame: float = 1.0,
+        most_unseen: float = 0.0,
+    ) -> float:
         """That the parameter is wrong and displaces the camera beyond a tolerance [deg, cm].
 
         What the estimate adds to it: Bayes' rule, of two kinds of lens parameters, usual ones and
         wrong ones. Their errors are normally distributed with mean zero; wrong ones are rare. What
         usual ones do to the pose is in its error bar. Where one of several was wrong, the others
-        look wrong, too, if each is set free alone: ``blame`` is how likely it is this one.
+        look wrong, too, if each is set free alone: ``blame`` is how likely it is this one. What was
+        probable before and the data do not show counts up to ``most_unseen``.
 
         An aspect ratio that no lens has counts even if the camera moves little when it is set free:
         matches from rounds have followed it. At the default tolerance any size of it counts. At a
         wider one it counts if half of it, as an angle, exceeds what the tolerance adds to the
         default rotation.
         """
-        is_wrong, after, before = self._shares_wrong(tolerance)
-        return max(is_wrong * blame * after - before, 0.0)
-
-    def probability_with_prior(self, tolerance: tuple[float, float]) -> float:
-        """The same with what was probable before: that these data do not show a wrong lens."""
-        is_wrong, after, _ = self._shares_wrong(tolerance)
-        return is_wrong * after
-
-    def _shares_wrong(self, tolerance: tuple[float, float]) -> tuple[float, float, float]:
-        """That it is wrong; if so, that it moves the camera too far; both before the estimate."""
         if not math.isfinite(self.sigma):  # not determined
-            return 0.0, 0.0, 0.0
+            return 0.0
         moves = max(moved / most for moved, most in zip(self.moved, tolerance, strict=True))
         counted = self.size / moves if moves else math.inf
         if self.name == ASPECT_RATIO:
@@ -162,9 +159,10 @@ class LensParameter:
             counted = math.radians(TOLERANCE[0]) * max(wider, 0.0) / (self.units[0] / 2)
         wrong, share = LENS_WRONG, LENS_WRONG_SHARE
         odds = logit(share) + self._log_density(wrong) - self._log_density(1.0)
-        gain = wrong / math.hypot(self.sigma, wrong)
+        is_wrong, gain = float(expit(odds)), wrong / math.hypot(self.sigma, wrong)
         after = _share_beyond(counted, gain**2 * self.size, gain * self.sigma)
-        return float(expit(odds)), after, share * _share_beyond(counted, 0.0, wrong)
+        shown = is_wrong * blame * after - share * _share_beyond(counted, 0.0, wrong)
+        return max(shown, min(is_wrong * after, most_unseen), 0.0)
 
     def _log_density(self, spread: float) -> float:
         """The log density of the values among parameters that spread so."""
@@ -235,9 +233,8 @@ def check_parameter(
     For a tolerance [deg, cm]; ``options`` are those that its estimate needs, " --interval-s 0.1".
     ``unseen``: whether what the data do not show counts.
     """
-    row, probability = threshold("lens"), found.probability(tolerance, blame)
-    if unseen:  # it blames no lens
-        probability = max(probability, min(found.probability_with_prior(tolerance), row.warn))
+    row = threshold("lens")  # what is not seen blames no lens
+    probability = found.probability(tolerance, blame=blame, most_unseen=row.warn * unseen)
     deg, cm = found.moved
     text = f"by the {by}, {found.describe()}; the camera would move by {deg:.2g} deg, {cm:.2g} cm"
     advice = "correct the time stamps" if found.name == TIME else row.advice
@@ -267,13 +264,3 @@ def advise_together(checks: Sequence[Check]) -> list[Check]:
         else check
         for check in checks
     ]
-
-
-def probability_of_lens(values: Iterable[tuple[str, Status, float | None]]) -> float:
-    """The probability that the worst of the lens parameters is wrong, by (kind, status, value).
-
-    One that is a WARN counts as one, whatever its value.
-    """
-    most: dict[Status, float] = {"FAIL": 1.0, "WARN": FAIL_ABOVE, "PASS": PASS_BELOW}
-    of_lens = [(status, value) for kind, status, value in values if kind in LENS_KINDS]
-    return max([0.0, *(min(value or 0.0, most[status]) for status, value in of_lens)])

@@ -23,6 +23,7 @@ from calibgraph.arrays import Array
 from calibgraph.model.verdict import (
     ABOUT_THE_DATA,
     COMMON_ERROR,
+    FAIL_ABOVE,
     FLAT_EVIDENCE,
     IMAGES_ELSEWHERE,
     PASS_BELOW,
@@ -32,7 +33,7 @@ from calibgraph.model.verdict import (
     Status,
     Verdict,
 )
-from calibgraph.trust.lens_parameter import LENS_KINDS, probability_of_lens
+from calibgraph.trust.lens_parameter import LENS_KINDS, advise_together
 
 TABLES, STRUCTURE = "tables", "structure"
 """The models: of correspondences from any source; of runs of the matcher."""
@@ -55,7 +56,8 @@ def judge(
     TABLES or STRUCTURE.
     """
     of_checks, odds = probability_of_checks(checks, model), _models()[model]["bar_odds"]
-    return Verdict(tuple(checks), ErrorProbability(of_checks, beyond, *tolerance, bar_odds=odds))
+    probability = ErrorProbability(of_checks, beyond, *tolerance, bar_odds=odds)
+    return Verdict(tuple(advise_together(checks)), probability)
 
 
 def probability_of_checks(checks: Sequence[Check], model: str) -> float:
@@ -75,10 +77,15 @@ def probability_of_checks(checks: Sequence[Check], model: str) -> float:
 
 
 def probability_by_values(values: Sequence[tuple[str, Status, float | None]]) -> float:
-    """By (kind, status, value) of the checks whose value is one: a wrong lens, a find by chance."""
-    by_chance = max((value or 0.0 for kind, _, value in values if kind == CHANCE), default=0.0)
-    by_chance = min(max(by_chance, 0.0), 1.0)  # tables may state anything
-    return 1.0 - (1.0 - probability_of_lens(values)) * (1.0 - by_chance)
+    """By (kind, status, value) of the checks whose value is one: a wrong lens, a find by chance.
+
+    Of the lens the worst parameter counts; one that is a WARN counts as one, whatever its value.
+    """
+    most: dict[Status, float] = {"FAIL": 1.0, "WARN": FAIL_ABOVE, "PASS": PASS_BELOW}
+    of_lens = [min(v or 0.0, most[status]) for kind, status, v in values if kind in LENS_KINDS]
+    by_chance = [value or 0.0 for kind, _, value in values if kind == CHANCE]
+    chance = min(max(0.0, *by_chance), 1.0) if by_chance else 0.0  # tables may state anything
+    return 1.0 - (1.0 - max([0.0, *of_lens])) * (1.0 - chance)
 
 
 def worst_severities(checks: Iterable[tuple[str, float]]) -> dict[str, float]:

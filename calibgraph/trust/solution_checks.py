@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -18,7 +18,7 @@ from calibgraph.solver.error_model import Conflict
 from calibgraph.solver.matches import CameraBlock
 from calibgraph.solver.robust import quantile
 from calibgraph.solver.solution import Solution
-from calibgraph.trust.evidence import Checks, Evidence
+from calibgraph.trust.evidence import Evidence, Found
 from calibgraph.trust.thresholds import threshold
 from factors.columns import CLOCK
 from factors.conditioning import invert_or_none
@@ -33,18 +33,16 @@ _NEAR_M, _FAR_M = 6.0, 20.0
 _SHALLOW = 2.0  # ratio of far to near
 
 
-def estimate_checks(evidence: Evidence) -> Checks:
+def estimate_checks(evidence: Evidence) -> Found:
     """The checks of every camera's estimate."""
-    solution, checks = evidence.solution, {}
-    unknown = evidence.joint_covariance is None
+    solution, unknown = evidence.solution, evidence.joint_covariance is None
     for name in evidence.cameras:
         block, own = solution.inliers.blocks.get(name), solution.fitted.frame_sums.get(name)
         used, held = 0 if block is None else len(block), name in solution.held
         if held or name not in solution.objective.blocks:
-            excluded = name in evidence.excluded
-            checks[name] = [_check_unmeasured(used, held=held, excluded=excluded)]
+            yield name, _check_unmeasured(used, held=held, excluded=name in evidence.excluded)
             continue
-        checks[name] = check_estimate(
+        checks = check_estimate(
             used=used,
             frames=0 if block is None else block.frames,
             covariance=evidence.covariance_by_matches(name),
@@ -56,7 +54,7 @@ def estimate_checks(evidence: Evidence) -> Checks:
             tolerance=solution.config.tolerance,
             lens=solution.lens.get(name, ()),
         )
-    return checks
+        yield from ((name, check) for check in checks)
 
 
 def _check_unmeasured(used: int, *, held: bool, excluded: bool) -> Check:
@@ -90,7 +88,7 @@ def check_estimate(  # noqa: PLR0913 - what a batch or the tracker knows of one 
     converged: bool = True,
     terms: Terms = "full",
     lens: Sequence[LensEstimate] = (),
-) -> list[Check]:
+) -> Iterator[Check]:
     """The checks of one camera's estimate, from a batch solve or while driving.
 
     Args:
@@ -105,34 +103,31 @@ def check_estimate(  # noqa: PLR0913 - what a batch or the tracker knows of one 
         terms: of the objective.
         lens: the parameters of lens and clock that were estimated.
     """
-    checks = [] if covariance is None else _check_sigmas(covariance, tolerance)
-    if scatter_only and checks:
+    if covariance is not None:
+        degrees, centimetres = degrees_and_centimetres(covariance)
+        yield threshold("sigma_rotation", tolerance).check(degrees.max())
+        yield threshold("sigma_translation", tolerance).check(centimetres.max())
+    if covariance is not None and scatter_only:
         text = (
             "scatter only: the table states no error that its frames share, so that the true error "
             "may be many times the error bar"
         )
-        checks.append(Check("common error", "WARN", text, kind=COMMON_ERROR))
-    checks += map(_check_relative_pose, conflicts)
+        yield Check("common error", "WARN", text, kind=COMMON_ERROR)
+    yield from map(_check_relative_pose, conflicts)
     if terms in ("stage1", "priors"):
         text = f"the terms {terms!r} do not fit the correspondences: no error bar"
-        checks.append(Check("terms", "WARN", text))
+        yield Check("terms", "WARN", text)
     elif covariance is None and is_free:
         text = "the correspondences leave directions of the pose free"
-        checks.append(Check("error bar", "FAIL", text, kind="free"))
+        yield Check("error bar", "FAIL", text, kind="free")
     elif covariance is None:
         text = "no error bar: the correspondences leave the pose of another camera free"
-        checks.append(Check("error bar", "WARN", text, kind="no_error_bar"))
-    checks.append(threshold("correspondences_used").check(used))
-    checks.append(threshold("frames").check(frames))
-    checks += map(_check_lens_prior, lens)
+        yield Check("error bar", "WARN", text, kind="no_error_bar")
+    yield threshold("correspondences_used").check(used)
+    yield threshold("frames").check(frames)
+    yield from map(_check_lens_prior, lens)
     text = f"the optimizer {'converged' if converged else 'did not converge'}"
-    return [*checks, Check("convergence", "PASS" if converged else "FAIL", text)]
-
-
-def _check_sigmas(covariance: Array, tolerance: tuple[float, float]) -> list[Check]:
-    """The error bar about its worst axes, of rotation and of translation."""
-    values = zip(("rotation", "translation"), degrees_and_centimetres(covariance), strict=True)
-    return [threshold(f"sigma_{part}", tolerance).check(float(v.max())) for part, v in values]
+    yield Check("convergence", "PASS" if converged else "FAIL", text)
 
 
 def _check_relative_pose(conflict: Conflict) -> Check:
@@ -155,33 +150,29 @@ def _check_lens_prior(one: LensEstimate) -> Check:
     return replace(check, text=text, kind="time_prior" if one.name in CLOCK else row.key)
 
 
-def flat_evidence_checks(evidence: Evidence) -> Checks:
+def flat_evidence_checks(evidence: Evidence) -> Found:
     """Whether the images leave a pose more open than the matches, where images are known."""
-    checks = {}
     for name in evidence.posteriors:
         wide, narrow = evidence.covariance_of(name), evidence.covariance_by_matches(name)
         if wide is not None and narrow is not None:
-            ratio = float(np.sqrt(np.diag(wide) / np.diag(narrow)).max())
-            checks[name] = [threshold("flat_evidence").check(ratio)]
-    return checks
+            ratio = np.sqrt(np.diag(wide) / np.diag(narrow)).max()
+            yield name, threshold("flat_evidence").check(ratio)
 
 
-def outlier_frame_checks(evidence: Evidence) -> Checks:
+def outlier_frame_checks(evidence: Evidence) -> Found:
     """How many frames were left out because they lie far from where most frames agree."""
-    row, counts = threshold("outlier_frames"), evidence.solution.counts
-    used = {name: counts[name] for name in evidence.fitted_blocks}
-    return {n: [row.check(of["outlier_frames"] / max(1, of["frames"]))] for n, of in used.items()}
+    for name in evidence.fitted_blocks:
+        counts = evidence.solution.counts[name]
+        share = counts["outlier_frames"] / max(1, counts["frames"])
+        yield name, threshold("outlier_frames").check(share)
 
 
-def repeated_frame_checks(evidence: Evidence) -> Checks:
+def repeated_frame_checks(evidence: Evidence) -> Found:
     """How many frames count as part of another one, where there are any."""
-    checks = {}
     for name, counts in evidence.solution.counts.items():
-        repeated = counts.get("repeated_frames", 0)
-        if repeated:
+        if repeated := counts.get("repeated_frames", 0):
             share = repeated / (repeated + counts["frames"])
-            checks[name] = [threshold("repeated_frames").check(share)]
-    return checks
+            yield name, threshold("repeated_frames").check(share)
 
 
 def residuals_of(solution: Solution) -> dict[str, Residuals]:

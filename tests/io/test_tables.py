@@ -17,7 +17,7 @@ from calibgraph import (
     simulate_correspondences,
 )
 from calibgraph.io.tables import from_arrow, load_camera_matches
-from calibgraph.model.camera_matches import COLUMNS, CameraMatches
+from calibgraph.model.camera_matches import CameraMatches
 from tests.conftest import make_pair
 from tests.model.tables import camera_matches, table, to_arrow
 
@@ -87,19 +87,21 @@ CSV: dict[str, bytes] = {
 MATCHES = camera_matches().to_arrow()
 CAMERA_MATCHES: dict[str, pa.Table] = {
     "is missing": MATCHES.drop_columns(["u_a_px"]),
-    "unknown columns": MATCHES.append_column("more", pa.array([1, 2, 3])),
+    "unknown column 'more'": MATCHES.append_column("more", pa.array([1, 2, 3])),
     "format": MATCHES.replace_schema_metadata({"format": "calibgraph-correspondences/1"}),
     "is empty": MATCHES.set_column(0, "camera_a", pa.array(["left", None, "right"])),
-    "wrong value": MATCHES.set_column(3, "u_a_px", pa.array(["x", "y", "z"])),
+    "'u_a_px' must hold numbers, found string": MATCHES.set_column(
+        3, "u_a_px", pa.array(["x", "y", "z"])
+    ),
     "row 0: planes": MATCHES.set_column(
-        COLUMNS.index("qx_a_per_m"), "qx_a_per_m", pa.array([None, 1.0, None])
+        MATCHES.column_names.index("qx_a_per_m"), "qx_a_per_m", pa.array([None, 1.0, None])
     ),
 }
 BAD = [
     *((load_correspondences, "table.parquet", *row) for row in CORRESPONDENCES.items()),
     *((load_correspondences, "table.csv", *row) for row in CSV.items()),
     *((load_camera_matches, "table.parquet", *row) for row in CAMERA_MATCHES.items()),
-    (load_camera_matches, "table.csv", "holds a wrong value: 'utf-8' codec", b"fr\xff\n"),
+    (load_camera_matches, "table.csv", "a column's name is not UTF-8", b"fr\xff\n"),
 ]
 
 

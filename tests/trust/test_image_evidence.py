@@ -19,15 +19,9 @@ from calibgraph.pipeline import to_calibration
 from calibgraph.solver.joint import solve_joint
 from calibgraph.trust import image_evidence
 from calibgraph.trust.assess import assess
-from calibgraph.trust.evidence import Evidence
-from calibgraph.trust.image_evidence import (
-    ImageEvidence,
-    evidence_checks,
-    frames_check,
-    measure_image_evidence,
-    pairing_checks,
-)
-from calibgraph.trust.image_record import RunChecks, to_metadata
+from calibgraph.trust.evidence import Evidence, by_camera
+from calibgraph.trust.image_evidence import check_images
+from calibgraph.trust.image_record import to_metadata
 from calibgraph.trust.inputs import displacement_of_parts
 from calibgraph.trust.pose_posterior import PosePosterior
 from tests.conftest import SAMPLE, make_pair
@@ -35,8 +29,6 @@ from tests.draws.lenses import with_known_lenses
 from tests.trust.conftest import simulated
 
 NAME = "front_left"
-
-NAMES = {n: f"{n:06}" for n in range(6)}
 
 
 @pytest.fixture
@@ -54,31 +46,29 @@ def with_clouds_of(dataset: Dataset, order: list[int]) -> Dataset:
     return replace(dataset, frames=tuple(swapped))
 
 
-def statuses(found: ImageEvidence) -> dict[str, str]:
-    checks = (*evidence_checks(found, NAMES), *pairing_checks(found))
-    return {check.name: check.status for check in checks}
+def checks_of(dataset: Dataset, rig: Rig) -> dict[str, Check]:
+    """Of one camera, by kind."""
+    found = check_images(dataset, rig.model_copy(update={"cameras": {NAME: rig.cameras[NAME]}}))
+    return {check.kind: check for _, check in found}
 
 
 def test_all_checks_pass_at_the_truth(dataset: Dataset, truth: Rig) -> None:
-    found = measure_image_evidence(dataset, truth)[NAME]
-    assert set(statuses(found).values()) == {"PASS"}
-    assert found.frames_best == 1.0
-    assert found.frames_lost == ()
+    found = checks_of(dataset, truth)
+    assert {check.status for check in found.values()} == {"PASS"}
+    assert found.keys() > {"displaced_z_score", "own_clouds", "focal_length"}
+    assert found["frames_best"].value == 1.0
 
 
 @pytest.mark.usefixtures("no_lens")
 def test_mispaired_clouds_fail_and_point_to_the_neighbour(dataset: Dataset, truth: Rig) -> None:
-    late = measure_image_evidence(with_clouds_of(dataset, [1, 2, 3, 4, 5, 0]), truth)[NAME]
-    assert late.pair_offset == -1
-    found = statuses(late)
-    assert found["score with the own clouds above that with neighbouring ones"] == "FAIL"
+    check = checks_of(with_clouds_of(dataset, [1, 2, 3, 4, 5, 0]), truth)["own_clouds"]
+    assert check.status == "FAIL" and "clouds of the previous frame better" in check.text
 
 
 @pytest.mark.usefixtures("no_lens")
 def test_a_single_mispaired_frame_is_named(dataset: Dataset, truth: Rig) -> None:
-    found = measure_image_evidence(with_clouds_of(dataset, [0, 1, 2, 5, 4, 5]), truth)[NAME]
-    assert found.frames_lost == (3,)
-    assert statuses(found)["share of the frames that fit the result best"] == "PASS"
+    check = checks_of(with_clouds_of(dataset, [0, 1, 2, 5, 4, 5]), truth)["frames_best"]
+    assert check.status == "PASS" and check.value == 5 / 6
 
 
 @pytest.mark.usefixtures("no_lens")
@@ -96,8 +86,7 @@ def test_a_camera_that_turns_halfway_is_no_pass(
         cv2.imwrite(str(path), cv2.warpPerspective(image, warp, image.shape[1::-1]))
         paths = {**frames[number].image_paths, NAME: path}
         frames[number] = replace(frames[number], image_paths=paths)
-    found = measure_image_evidence(replace(dataset, frames=tuple(frames)), truth)[NAME]
-    check = frames_check(found, NAMES)
+    check = checks_of(replace(dataset, frames=tuple(frames)), truth)["frames_best"]
     assert check.status == "WARN"
     assert "000003, 000004, 000005 fit another extrinsic better" in check.text
 
@@ -107,13 +96,13 @@ def test_mispaired_clouds_are_detected_though_their_neighbours_were_not_selected
     dataset: Dataset, truth: Rig
 ) -> None:
     late = with_clouds_of(dataset, [1, 2, 3, 4, 5, 5]).select("0:5:2")
-    found = measure_image_evidence(late, truth)[NAME]
-    assert found.pair_offset == -1 and found.pair_margin < 0
+    check = checks_of(late, truth)["own_clouds"]
+    assert check.value < 0 and "clouds of the previous frame better" in check.text
 
 
 def test_a_wrong_optimum_fails(dataset: Dataset, truth: Rig) -> None:
     displaced = calibgraph.perturb(truth, rotation_deg=1.2, translation_m=0.1)
-    assert "FAIL" in statuses(measure_image_evidence(dataset, displaced)[NAME]).values()
+    assert "FAIL" in {check.status for check in checks_of(dataset, displaced).values()}
 
 
 def test_a_camera_without_structure_gets_a_warning(
@@ -122,8 +111,7 @@ def test_a_camera_without_structure_gets_a_warning(
     points = np.random.default_rng(0).uniform(5, 6, (10, 4)).astype(np.float32)
     np.save(tmp_path / "few.npy", points)
     frames = tuple(replace(frame, cloud_path=tmp_path / "few.npy") for frame in dataset.frames)
-    found = measure_image_evidence(replace(dataset, frames=frames), truth)[NAME]
-    (check,) = evidence_checks(found, NAMES)
+    (check,) = checks_of(replace(dataset, frames=frames), truth).values()
     assert check.status == "WARN" and "structure in both image and cloud" in check.text
 
 
@@ -181,9 +169,10 @@ def left_by_run(pair: Rig) -> Run:
     solution = solve_joint(pair, simulated(pair, frames=20))
     posterior = PosePosterior(0.1 * FLAT, FLAT, 0.3)
     evidence = Evidence(solution, pair, {CAMERA: posterior})
-    checks = RunChecks(assess(evidence), {CAMERA: [FAILED]}, {CAMERA: [CAUSE]})
-    table = solution.correspondences
-    seen = table.with_metadata({**table.metadata, **to_metadata(evidence, checks)})
+    of_solution, table = assess(evidence), solution.correspondences
+    causes, of_run = (by_camera(pair.cameras, iter([(CAMERA, of)])) for of in (CAUSE, FAILED))
+    checks = {name: causes[name] + of_solution[name] + of_run[name] for name in pair.cameras}
+    seen = table.with_metadata({**table.metadata, **to_metadata(evidence, causes, of_run)})
     return to_calibration(evidence, checks), seen
 
 

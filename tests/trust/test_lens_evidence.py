@@ -11,8 +11,15 @@ import calibgraph
 from calibgraph import Camera, Rig
 from calibgraph.model.places import Places
 from calibgraph.solver.columns import apply_twist
-from calibgraph.trust.image_evidence import WIDE, ImageEvidence, evidence_checks, measure_lens
-from calibgraph.trust.lens_parameter import NAMES, Free, LensParameter, lens_variable
+from calibgraph.trust.image_evidence import WIDE, measure_lens
+from calibgraph.trust.lens_parameter import (
+    IMAGES,
+    NAMES,
+    Free,
+    LensParameter,
+    check_parameter,
+    lens_variable,
+)
 from calibgraph.trust.pose_posterior import FrameScorer
 from tests.conftest import SAMPLE
 
@@ -46,18 +53,6 @@ def measure(camera: Camera) -> tuple[LensParameter, ...]:
         )
 
 
-def statuses(lens: tuple[LensParameter, ...]) -> dict[str, str]:
-    """Of the checks of the lens, of a calibrated pose: the true one of another lens fits less."""
-    found = ImageEvidence(
-        groups=100,
-        lens=lens,
-        displaced_z_score=5.0,
-        frames_best=1.0,
-    )
-    checks = {check.kind: check.status for check in evidence_checks(found, {})}
-    return {name: checks[name.replace(" ", "_")] for name in NAMES}
-
-
 @pytest.mark.parametrize(
     ("number", "error", "name"),
     [
@@ -76,7 +71,7 @@ def test_a_wrong_lens_is_named_and_measured(
     found = measure(apply_twist(wrong, np.array([0.0, turn, 0.0, 0.0, 0.0, 0.0])))
     (value,) = CALIBRATED * found[[*NAMES].index(name)].values
     assert value == pytest.approx(-error, abs=0.2 * abs(error) + 0.004)
-    status = statuses(found)
+    status = {each.name: check_parameter(each, IMAGES).status for each in found}
     assert status[name] != "PASS"
     if name == "aspect ratio":  # half of it is a focal length
         return

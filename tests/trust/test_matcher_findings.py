@@ -12,6 +12,7 @@ import calibgraph
 from calibgraph import Correspondences, Rig, simulate_correspondences
 from calibgraph.progress import no_progress
 from calibgraph.rounds import match_in_rounds
+from calibgraph.trust.evidence import by_camera
 from calibgraph.trust.matcher_checks import compare_ends
 from tests.conftest import SAMPLE
 
@@ -143,7 +144,7 @@ def test_a_matcher_that_comes_back_passes_and_one_that_ends_elsewhere_fails(
 ) -> None:
     end = calibgraph.perturb(truth, rotation_deg=deg, translation_m=deg / 10, seed=1)
     matched = match_in_rounds(SAMPLE, truth, Simulated(truth, end), progress=no_progress)
-    for checks in compare_ends(matched).values():
+    for checks in by_camera(truth.cameras, compare_ends(matched)).values():
         assert [check.status for check in checks][:1] == [status]
         assert checks[0].value == pytest.approx(deg, abs=0.02)
 
@@ -165,7 +166,8 @@ def test_a_camera_is_taken_from_where_image_and_cloud_agree_clearly_better(truth
         assert errors[name].translation_error_cm == pytest.approx(8, abs=1)
     expected = {"front_left": 18.0, "front_right": 20.0, "left": 18.0}
     assert matched.correspondences.metadata["z_score"] == expected
-    for checks in compare_ends(matched).values():  # two different ends are a warning
+    ends = by_camera(truth.cameras, compare_ends(matched))
+    for checks in ends.values():  # two different ends are a warning
         assert checks[1].status == "WARN" and checks[1].value == pytest.approx(8, abs=1)
     began = calibgraph.evaluate(matched.solution.rig, truth).cameras
     assert began["left"].translation_error_cm < 1e-6  # the guess, of the first rounds

@@ -18,7 +18,6 @@ from calibgraph.pipeline import to_calibration
 from calibgraph.solver.joint import solve_joint
 from calibgraph.trust.assess import assess
 from calibgraph.trust.evidence import Evidence
-from calibgraph.trust.image_record import RunChecks
 from calibgraph.trust.pose_posterior import (
     REACH,
     PosePosterior,
@@ -154,9 +153,8 @@ def test_a_wider_surface_is_doubt_of_the_error_bar_alone_and_no_check_fails(
     solution = solve_joint(pair, simulated(pair, frames=20))
     covariance = Evidence(solution, pair).covariance_of("left")
     evidence = Evidence(solution, pair, {"left": certain(wider**2 * covariance)})
-    found = to_calibration(
-        evidence, RunChecks(assess(evidence), unseen=evidence.cameras)
-    ).camera_verdicts["left"]
+    result = to_calibration(evidence, assess(evidence), unseen=evidence.cameras)
+    found = result.camera_verdicts["left"]
     (check,) = (each for each in found.checks if each.kind == "flat_evidence")
     assert check.status == status
     assert check.value == pytest.approx(wider)

@@ -26,7 +26,7 @@ from calibgraph.io.frame import Frame
 from calibgraph.model.findings import error_components
 from calibgraph.solver.joint import solve_joint
 from calibgraph.trust.agreement import check_competing_solution
-from calibgraph.trust.evidence import Checks
+from calibgraph.trust.evidence import Checks, by_camera
 from calibgraph.trust.matcher_checks import repeated_file_checks
 from calibgraph.trust.solution_checks import weakest_direction
 from tests.conftest import SAMPLE
@@ -106,12 +106,11 @@ def test_frames_with_the_same_cloud_or_image_are_reported() -> None:
     hashes = {path: digest for frame in data.frames for path, digest in frame.hashes().items()}
 
     def check(frames: Sequence[Frame], copies: Sequence[tuple[str, str]] = ()) -> Checks:
-        return repeated_file_checks(
-            SimpleNamespace(
-                dataset=replace(data, frames=tuple(frames)), hashes=hashes, copies=copies,
-                guess=data.rig,
-            )
+        run = SimpleNamespace(
+            dataset=replace(data, frames=tuple(frames)), hashes=hashes, copies=copies,
+            guess=data.rig,
         )  # fmt: skip
+        return by_camera(data.rig.cameras, repeated_file_checks(run))
 
     assert check(data.frames) == {"left": [], "front_left": [], "front_right": []}
     copy = replace(data.frames[0], index=3, name="copy")

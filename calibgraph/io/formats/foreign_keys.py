@@ -23,7 +23,6 @@ from calibgraph.io.lenses import (
     CameraLens,
     fitted_coefficients,
     intrinsics_of_matrix,
-    listed_coefficients,
     listed_intrinsics,
     stated_model,
     unified_coefficients,
@@ -265,8 +264,8 @@ class _Map:
                 raise FileError(self._where, "key 'xi' is missing; add it")
             mirror, *others = values if xi is None else [self._number(xi), *values]
             return model, unified_coefficients(mirror, others, self._where), note
-        fit = fitted_coefficients if key is None else listed_coefficients
-        return model, fit(values, model, self._where), note
+        listed = key is not None
+        return model, fitted_coefficients(values, model, self._where, listed=listed), note
 
     def _assume(self, found: Array, key: str) -> str:
         """The note on a pinhole that no key states."""

@@ -57,8 +57,8 @@ def test_scores_are_those_of_the_formula_wherever_a_window_is_in_the_image(
     counts = rng.integers(9, 13, 100)
     group = np.repeat([0, 1, 3], [30, 50, 20])
     origin = -np.array(size[::-1]) // 2
-    grids, expected = np.zeros((4, *size), np.float32), np.zeros((4, *size))
-    score_windows(
+    grids, (expected, seen) = np.zeros((4, *size), np.float32), np.zeros((2, 4, *size))
+    inside = score_windows(
         pad(image), places.astype(np.int32), counts.astype(np.int32), basis, group.astype(np.int32),
         origin, likelihood, grids,
     )  # fmt: skip
@@ -68,9 +68,11 @@ def test_scores_are_those_of_the_formula_wherever_a_window_is_in_the_image(
             if min(u.min(), v.min()) >= 0 and u.max() < 30 and v.max() < 20:
                 score = formula(image[v, u] - image.mean(), columns[:n], likelihood)
                 expected[g, row, column] += score
+                seen[g, row, column] += 1
     rounding = 50 * 12 * np.finfo(np.float32).eps  # of the windows of a group, and their points
     assert np.count_nonzero(expected) > 0.5 * expected[[0, 1, 3]].size
     np.testing.assert_allclose(grids, expected, rtol=rounding, atol=rounding)
+    np.testing.assert_array_equal(inside, seen if likelihood else seen[:0])
 
 
 def formula(seen: np.ndarray, basis: np.ndarray, likelihood: bool) -> float:

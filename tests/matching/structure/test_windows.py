@@ -69,13 +69,13 @@ def test_windows_come_from_clouds_with_and_without_intensity(truth: Rig) -> None
     raw[:, 3] = np.nan
     cloud = PreparedCloud.from_points(raw)
     blind = select_windows(cloud, camera, LEVELS[3], max_windows=10_000)
-    assert len(windows.counts) > len(blind.counts) > 100
+    assert len(windows) > len(blind) > 100
     # Without intensities all ranks are equal: their mean rounds by 1e-16, which the column divides
     # by 1e-6 and weighs by 1e-15.
-    assert np.abs(blind.basis[:, :, 1]).max() < 1e-20
+    assert np.abs(blind["basis"][:, :, 1]).max() < 1e-20
     # Columns are orthogonal to constants and to each other.
     for w in range(50):
-        basis = windows.basis[w, : windows.counts[w]].astype(float)
+        basis = windows["basis"][w, : windows["count"][w]].astype(float)
         np.testing.assert_allclose(basis.sum(axis=0), 0, atol=1e-4)
         gram = basis.T @ basis
         np.testing.assert_allclose(gram - np.diag(np.diag(gram)), 0, atol=1e-4)
@@ -94,6 +94,6 @@ def test_fisheyes_and_views_past_90_degrees_give_windows() -> None:
     cloud = PreparedCloud.from_points(raw)
     windows = select_windows(cloud, camera, LEVELS[2], max_windows=10_000)
     T = camera.T_camera_lidar
-    z = (windows.rays_m.reshape(-1, 3) @ T[:3, :3].T + T[:3, 3])[:, 2]
+    z = (windows["rays_m"].reshape(-1, 3) @ T[:3, :3].T + T[:3, 3])[:, 2]
     assert z.min() < 0 < z.max()
-    assert len(windows.counts) > 100
+    assert len(windows) > 100
