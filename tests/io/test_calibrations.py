@@ -35,8 +35,13 @@ WRONG: dict[str, Any] = {
 }
 
 
-@pytest.mark.parametrize("number", [float("inf"), float("nan"), 1e308, -1e308])
-@pytest.mark.parametrize("key", ["covariance", "timings_s", "residuals", "rounds", "error_sources"])
+@pytest.mark.parametrize(
+    ("key", "number"),
+    [
+        *(("covariance", number) for number in (float("inf"), float("nan"), 1e308, -1e308)),
+        *((key, 1e308) for key in ("timings_s", "residuals", "rounds", "error_sources")),
+    ],
+)
 def test_numbers_that_no_measurement_has_are_refused(
     key: str, number: float, calibrated_sample: CommandRun, tmp_path: Path
 ) -> None:

@@ -4,7 +4,6 @@ import math
 from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,19 +11,19 @@ import pytest
 
 from calibgraph import Rig
 from calibgraph.matching.structure import acceptance, global_search, pose_search
-from calibgraph.matching.structure.acceptance import (
-    Chance,
-    least_z_score,
-    second_look_chance,
-)
+from calibgraph.matching.structure.acceptance import Chance, least_z_score, second_look_chance
 from calibgraph.matching.structure.bodies import Body, lead, place
 from calibgraph.matching.structure.global_search import TRIES, Found, Locator
 from calibgraph.matching.structure.pose_refinement import Candidate
+<<<<<<< HEAD
 from calibgraph.matching.structure.pose_search import (
     CONFIDENT,
     PROMISING,
     PoseSearch,
 )
+=======
+from calibgraph.matching.structure.pose_search import CONFIDENT, PROMISING, PoseSearch, SearchRange
+>>>>>>> w-tst
 from calibgraph.progress import no_progress
 from tests.conftest import stereo_relative_pose
 from tests.matching.structure.data import never
@@ -179,6 +178,7 @@ def test_of_the_rolls_those_are_tried_until_a_pose_is_beyond_doubt(
     assert (len(tried), found.z_score) == (rolls, max(by_roll[:rolls]))
 
 
+<<<<<<< HEAD
 def test_a_candidate_that_an_approach_ranks_last_is_refined_too(
     one: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -205,6 +205,8 @@ def test_a_candidate_that_an_approach_ranks_last_is_refined_too(
     np.testing.assert_allclose(lead(best.body).T_camera_lidar, found[-1], atol=1e-9)
 
 
+=======
+>>>>>>> w-tst
 def test_one_camera_is_searched_and_the_other_placed_where_it_is_seen(two: Rig) -> None:
     """The camera that is more promising at its guess is searched first."""
     first, second = (two.T_camera_lidar[name] for name in NAMES)
