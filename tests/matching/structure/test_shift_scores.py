@@ -13,8 +13,6 @@ from calibgraph.matching.structure.score_kernel import (
     CHANCE_DEPTH,
     CHANCE_INTENSITY,
     GRAY_NOISE,
-    LANES,
-    LINES,
     MIN_RESIDUAL_SHARE,
     OPPOSITE,
     pad,
@@ -25,30 +23,6 @@ from calibgraph.model.rig import Camera
 from tests.conftest import SAMPLE
 
 
-<<<<<<< HEAD
-def test_an_image_is_scaled_once_for_each_size(monkeypatch: pytest.MonkeyPatch) -> None:
-    data, cache = calibgraph.load_dataset(SAMPLE), FrameCache()
-    camera = data.rig.cameras["left"]
-    image, other = (cache.image(frame, "left", camera) for frame in data.frames[:2])
-    padded, scale = image.log_gray(camera, 0.02, 1.0)
-    shape = round(scale[1] * camera.height_px), round(scale[0] * camera.width_px)
-    assert padded.shape == (shape[0] + LINES, shape[1] + LANES)
-    assert image.log_gray(camera, 0.02, 1.0)[0] is padded
-    assert image.log_gray(camera, 0.01, 1.0)[0].shape > padded.shape
-    assert (other.log_gray(camera, 0.02, 1.0)[0] != padded).any()
-    np.testing.assert_array_equal(image.mirrored().gray, image.gray[:, ::-1])
-    cache.keep_only(data.frames[2:])
-    assert not image.derived.values()
-    monkeypatch.setattr(frame_cache, "MAX_DERIVED_BYTES", padded.nbytes)
-    cache = FrameCache()
-    image, other = (cache.image(frame, "left", camera) for frame in data.frames[:2])
-    kept = image.log_gray(camera, 0.02, 1.0)[0]
-    other.log_gray(camera, 0.02, 1.0)
-    assert image.log_gray(camera, 0.02, 1.0)[0] is not kept
-
-
-=======
->>>>>>> w-tst
 def test_images_finer_than_the_finest_level_needs_are_reduced() -> None:
     """By whole pixels, which moves nothing; their logarithm changes by the rounding of gray."""
     camera = calibgraph.load_dataset(SAMPLE).rig.cameras["left"]
