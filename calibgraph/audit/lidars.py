@@ -6,8 +6,6 @@ result have error bars, which count beside those of the measurement.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.linalg import block_diag
 
@@ -17,6 +15,7 @@ from calibgraph.audit.judgement import (
     LIDAR_AXES,
     SINGLE_LIDAR,
     Limits,
+    Measured,
     detectable,
     judge_deviation,
 )
@@ -34,29 +33,10 @@ _LEAST_FREEDOM = 3.0  # of one place, where the size is a prior
 _UNUSABLE = ("lidar_matched", "lidar_start")  # kinds of checks
 
 
-@dataclass(frozen=True, eq=False)
-class MeasuredLidars:
-    """The LiDARs but the base, measured again.
-
-    Attributes:
-        audits: per LiDAR.
-        deviation: (6 k,) of all, as of an audit; empty if they could not be measured.
-        covariance: (6 k, 6 k) of it.
-        T_lidar_base: (4, 4) each, as deployed.
-        poses: as measured; None if they could not be.
-    """
-
-    audits: dict[str, CameraAudit]
-    deviation: Array
-    covariance: Array
-    T_lidar_base: list[Array]
-    poses: LidarPoses | None = None
-
-
 def measure_lidars(
     deployed: Rig, data: Dataset, config: Config, tolerance: Array, *, sensors: int,
     progress: Progress,
-) -> MeasuredLidars:  # fmt: skip
+) -> tuple[Measured, LidarPoses | None]:  # fmt: skip
     """Measure the LiDARs of a rig again, and compare them with where they are deployed.
 
     Args:
@@ -66,6 +46,9 @@ def measure_lidars(
         tolerance: (2,) of a turn [rad] and a shift [m].
         sensors: number of all that are compared, over which false alarms are shared.
         progress: called as the work goes on.
+
+    Returns:
+        The comparison of those but the base; their poses, None if they could not be measured.
 
     Raises:
         RigError: if a LiDAR has no pose.
@@ -84,7 +67,7 @@ def measure_lidars(
         if error.__class__ is not CalibrationError:  # of the data
             raise
         audits = {name: CameraAudit("CANNOT TELL", str(error)) for name in names}
-        return MeasuredLidars(audits, np.empty(0), np.empty((0, 0)), [])
+        return Measured(audits), None
     T_lidar_base = [invert(known[name]) for name in names]
     now = found.poses.T_base_lidar
     deviations = [
@@ -105,8 +88,7 @@ def measure_lidars(
         audits[name] = CameraAudit(
             status, reason, deviations[row], sigma, detectable(sigma, limits.confident)
         )
-    deviation = np.concatenate(deviations)
-    return MeasuredLidars(audits, deviation, covariance, T_lidar_base, found.poses)
+    return Measured(audits, deviations, covariance, T_lidar_base), found.poses
 
 
 def freedom_of_places(places: int, lidars: int) -> float:

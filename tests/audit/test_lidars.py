@@ -64,7 +64,7 @@ def measured(monkeypatch, poses: LidarPoses, deployed: Rig, tolerance: Array):
     verdicts = {name: judge_lidar(poses, name, TOLERANCE) for name in poses.covariance}
     found = SimpleNamespace(poses=poses, verdicts=verdicts)
     monkeypatch.setattr(audit_of_lidars, "calibrate_rig_lidars", lambda *_, **__: found)
-    return measure_lidars(deployed, None, Config(), tolerance, sensors=2, progress=no_progress)
+    return measure_lidars(deployed, None, Config(), tolerance, sensors=2, progress=no_progress)[0]
 
 
 @pytest.mark.parametrize("moved", ["", "front", "left"])
@@ -86,7 +86,7 @@ def test_lidars_that_overlap_too_little_cannot_be_told_and_unknown_ones_are_refu
         raise CalibrationError("LiDAR 'left' sees 3 planes")
 
     monkeypatch.setattr(audit_of_lidars, "calibrate_rig_lidars", fail)
-    found = measure_lidars(deployed, None, Config(), tolerance, sensors=2, progress=no_progress)
+    found, _ = measure_lidars(deployed, None, Config(), tolerance, sensors=2, progress=no_progress)
     assert {of.status for of in found.audits.values()} == {"CANNOT TELL"}
     assert "sees 3 planes" in found.audits["left"].reason
     unknown = deployed.model_copy(update={"lidars": {**deployed.lidars, "left": Lidar()}})
