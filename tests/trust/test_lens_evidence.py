@@ -52,11 +52,8 @@ def measure(
     dataset = dataset or calibgraph.load_dataset(SAMPLE, Rig(cameras={NAME: camera}))
     with ThreadPoolExecutor(2) as pool:
         scorer = FrameScorer(dataset, dataset.frames, pool)
-        images = scorer.load_images(NAME, camera)
-        scores = scorer.score_together(images, camera, WIDE)
-        return measure_lens(
-            scorer, images, camera, scores, seed=0, places=Places(stationary=(stop,))
-        )
+        scores = scorer.score_together(NAME, camera, WIDE)
+        return measure_lens(scorer, NAME, camera, scores, seed=0, places=Places(stationary=(stop,)))
 
 
 @pytest.mark.parametrize(
@@ -101,10 +98,9 @@ def test_the_lens_is_applied_to_points_where_they_are_when_they_are_seen(
     moving = tuple(Frame(*each, find_twist=lambda: twist) for each in files)
     with ThreadPoolExecutor(2) as pool:
         scorer = FrameScorer(replace(data, frames=moving), moving, pool)
-        images = scorer.load_images(NAME, late)
-        scores = scorer.score_together(images, late, WIDE)
+        scores = scorer.score_together(NAME, late, WIDE)
         with pytest.raises(_Seen) as seen:
-            measure_lens(scorer, images, late, scores, seed=0)
+            measure_lens(scorer, NAME, late, scores, seed=0)
     step = gtsam.Pose3.Expmap(-0.05 * twist).matrix()
     expected = scores.points_lidar_m @ step[:3, :3].T + step[:3, 3]
     np.testing.assert_allclose(seen.value.args[0], expected, atol=1e-9)
