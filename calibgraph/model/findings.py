@@ -168,7 +168,7 @@ def joined_metadata(tables: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     if any(one.get(IMAGES) != joined.get(IMAGES) for one in tables):
         joined[IMAGES] = _joined_images([one.get(IMAGES) for one in tables])
     for key in _COMMON:
-        stated = [one.get(key) for one in tables]
+        stated: list[Any] = [one.get(key) for one in tables]
         if None in stated:
             joined.pop(key, None)
         else:
