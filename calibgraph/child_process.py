@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing import Pipe
@@ -46,8 +46,20 @@ class Outcome:
     log: str = ""
 
 
-def describe_failure(error: Exception) -> tuple[ErrorKind, str]:
-    """The kind of a job's failure, and its text: wrong data are no fault of the machine's."""
+def failed(error: Exception, places: Mapping[str, str]) -> Outcome:
+    """The outcome of a job that failed: wrong data are no fault of the machine's.
+
+    Args:
+        error: of the job.
+        places: parts of its text that are of this machine, as paths, and what to read for them.
+    """
+    kind, text = _describe(error)
+    for place, name in places.items():
+        text = text.replace(place, name)
+    return Outcome(error_kind=kind, error=str(CalibrationError(text)))  # in one line
+
+
+def _describe(error: Exception) -> tuple[ErrorKind, str]:
     if isinstance(error, MemoryError):
         why = f" ({error})" if str(error) else ""
         return "out of memory", f"not enough memory{why}; give fewer frames, or more --memory-gb"
@@ -60,11 +72,11 @@ def describe_failure(error: Exception) -> tuple[ErrorKind, str]:
 
 
 class ChildEndedError(Exception):
-    """The process ended before its answer, or could not be started."""
+    """The process ended before its answer, or could not be started; after a timeout by us."""
 
-
-class ChildTimeoutError(Exception):
-    """The answer did not come in time; the process was ended."""
+    def __init__(self, text: str, kind: ErrorKind = "worker died") -> None:
+        super().__init__(text)
+        self.kind = kind
 
 
 class ChildProcess:
@@ -78,20 +90,44 @@ class ChildProcess:
 
     def start(self) -> None:
         """Start the process unless it runs, and wait until it is ready."""
+        if self._process is not None and self._process.poll() is None and not self._is_closed:
+            return
+        self.stop()
         try:
-            self._start()
+            if self._is_closed:
+                raise OSError("closed")
+            ours, theirs = Pipe()
+            # It finds modules where this one does, not in the folder it is started in.
+            known = [os.environ.get("PYTHONPATH", ""), *sys.path]
+            process = subprocess.Popen(
+                [sys.executable, "-P", "-m", self._module, str(theirs.fileno()), *self._arguments],
+                stdin=subprocess.PIPE,  # it ends with this process
+                stdout=subprocess.DEVNULL,
+                pass_fds=[theirs.fileno()],
+                env={
+                    **os.environ,
+                    **_ONE_THREAD,
+                    "PYTHONPATH": os.pathsep.join(filter(None, known)),
+                },
+                start_new_session=True,  # Ctrl-C is for the command
+            )
+            theirs.close()
+            self._process, self._connection = process, ours
+            ours.recv()  # it is ready
+            if self._is_closed:
+                raise OSError("closed")
         except (OSError, EOFError) as error:
+            self.stop()
             raise ChildEndedError(f"no process can be started ({error})") from error
 
     def ask(self, request: Any, timeout_s: float, on_note: Note | None = None) -> Any:
         """The answer of the process that :meth:`start` started.
 
         Raises:
-            ChildEndedError: if the process ends first.
-            ChildTimeoutError: if it takes longer.
+            ChildEndedError: if the process ends first, or if it takes longer.
         """
         process, connection = self._process, self._connection
-        if process is None or connection is None:
+        if process is None or connection is None:  # by another thread
             raise ChildEndedError("the process was ended")
         end = time.monotonic() + timeout_s
         try:
@@ -106,31 +142,7 @@ class ChildProcess:
             self.stop()
             raise ChildEndedError(_how_it_ended(process.wait())) from None
         self.stop()
-        raise ChildTimeoutError(f"took over {timeout_s:g} s")
-
-    def _start(self) -> None:
-        if self._is_closed:
-            raise OSError("closed")
-        if self._process is not None and self._connection is not None:
-            if self._process.poll() is None:
-                return
-            self.stop()
-        ours, theirs = Pipe()
-        # It finds modules where this one does, not in the folder it is started in.
-        folders = os.pathsep.join([os.environ.get("PYTHONPATH", ""), *sys.path]).strip(os.pathsep)
-        process = subprocess.Popen(
-            [sys.executable, "-P", "-m", self._module, str(theirs.fileno()), *self._arguments],
-            stdin=subprocess.PIPE,  # it ends with this process
-            stdout=subprocess.DEVNULL,
-            pass_fds=[theirs.fileno()],
-            env={**os.environ, **_ONE_THREAD, "PYTHONPATH": folders},
-            start_new_session=True,  # Ctrl-C is for the command
-        )
-        theirs.close()
-        self._process, self._connection = process, ours
-        ours.recv()  # it is ready
-        if self._is_closed:
-            raise OSError("closed")
+        raise ChildEndedError(f"took over {timeout_s:g} s", "timeout")
 
     def stop(self) -> None:
         """End the process, when no other thread uses it; the next request starts another."""

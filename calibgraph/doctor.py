@@ -1,6 +1,6 @@
 """Examine a dataset before anything is solved: its content, and the problems to fix first."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -25,10 +25,11 @@ from calibgraph.matching.structure.matcher import MOST_FRAMES
 from calibgraph.model.places import as_groups, describe_places
 from calibgraph.model.rig import Rig
 from calibgraph.parallel import map_on_cores
-from calibgraph.report.page_overlays import write_overlays
+from calibgraph.report.pictures import write_overlays
 from calibgraph.solver.covariance import ENOUGH_FRAMES
 from calibgraph.trust.inputs import (
     Finding,
+    Level,
     count_points_in_view,
     describe_brightness,
     describe_out_of_view,
@@ -37,7 +38,8 @@ from calibgraph.trust.inputs import (
     find_doubts,
 )
 
-_ORDER = ("error", "warning", "note")
+_Found = dict[Level, list[str]]
+"""What is found, the most severe level first."""
 
 
 @dataclass(frozen=True)
@@ -93,98 +95,94 @@ def diagnose(
     Raises:
         ValueError: if the options do not fit.
     """
-    findings: list[Finding] = []
-    data = _load(folders, rig, frames, bag, findings=findings)
-    if data is None:
-        return Diagnosis(tuple(findings))
-    findings += _describe(data)
-    if not data.rig.cameras:
-        return Diagnosis(tuple(findings))
-    findings += [Finding("error", line) for line in find_same_images(data, data.rig)]
-    data = hide_burnt_in(data, data.rig)
-    findings += [Finding("warning", line) for line in describe_burnt_in(data)]
-    choice = choose_frames(data, data.rig, MOST_FRAMES)
-    examined = choice.dataset
-    findings += [Finding("note", choice.text)] if choice.text else []
-    readable = _examine_frames(examined.frames, data.rig, findings)
-    seen: dict[str, int] = {}
-    written: list[Path] = []
-    if readable:
-        frame = readable[len(readable) // 2]
-        cloud = frame.load_cloud()
-        seen = count_points_in_view(data.rig, cloud)
-        findings += _examine_places(examined, max(seen, key=seen.__getitem__), cloud)
-        findings += _examine_guess(examined, (frame, cloud), seen)
-        if pictures is not None and not any(finding.level == "error" for finding in findings):
-            written = write_overlays(frame, data.rig, pictures)
-    findings.sort(key=lambda finding: _ORDER.index(finding.level))
-    return Diagnosis(tuple(findings), len(data.frames), seen, tuple(written))
+    found: _Found = {"error": [], "warning": [], "note": []}
+    data = _load(folders, rig, found, frames=frames, bag=bag)
+    count, seen, written = 0, dict[str, int](), list[Path]()
+    if data is not None:
+        count = len(data.frames)
+        _describe(data, found)
+        if data.rig.cameras:
+            seen, written = _examine(data, found, pictures)
+    findings = (Finding(level, text) for level, texts in found.items() for text in texts)
+    return Diagnosis(tuple(findings), count, seen, tuple(written))
 
 
 def _load(
-    folders: Sequence[Path],
-    rig: Rig | None,
-    frames: str | None,
-    bag: BagOptions | None,
-    *,
-    findings: list[Finding],
+    folders: Sequence[Path], rig: Rig | None, found: _Found, **options: Any
 ) -> Dataset | None:
     """The dataset, without frames that do not pair up; None if there is none."""
     try:
-        return load_dataset(folders, rig, frames=frames, bag=bag)
+        return load_dataset(folders, rig, **options)
     except (CalibrationError, OSError) as error:
-        findings.append(Finding("error", str(error)))
-        if not isinstance(error, DatasetError) or frames is not None or any(map(is_bag, folders)):
+        found["error"].append(str(error))
+        is_selected = options["frames"] is not None or any(map(is_bag, folders))
+        if not isinstance(error, DatasetError) or is_selected:
             return None
     try:
         given = rig if rig is not None else load_rig(folders[0])
         cameras = list(given.cameras)
-        found = [f for path in folders for f in frames_of_folder(path, cameras, complete=False)[0]]
-        paired = [str(i) for i, one in enumerate(found) if one.image_paths.keys() >= {*cameras}]
+        every = [f for path in folders for f in frames_of_folder(path, cameras, complete=False)[0]]
+        paired = [str(i) for i, one in enumerate(every) if one.image_paths.keys() >= {*cameras}]
         return load_dataset(folders, rig, frames=",".join(paired)) if paired else None
     except (CalibrationError, OSError):
         return None
 
 
-def _describe(data: Dataset) -> Iterator[Finding]:
+def _describe(data: Dataset, found: _Found) -> None:
     """The content of the dataset, and whether there are enough frames."""
     counts = {"frame": (count := len(data.frames)), "camera": len(data.rig.cameras)}
     counts |= {"LiDAR": len(data.rig.lidars)} if data.rig.lidars else {}
     words = (f"{number} {noun}{'' if number == 1 else 's'}" for noun, number in counts.items())
-    yield Finding("note", ", ".join(words))
-    yield from (Finding("note", note) for note in data.notes)
+    found["note"] += [", ".join(words), *data.notes]
     if not set(describe_rig(data.rig)) & set(data.notes):
-        yield from (Finding("note", line) for line in describe_rig(data.rig))
+        found["note"] += describe_rig(data.rig)
     if count < ENOUGH_FRAMES:
-        yield Finding(
-            "warning",
+        found["warning"].append(
             f"{count} frames: the error bar will be a wide default; record at least "
-            f"{ENOUGH_FRAMES}, better 10 to 30 from several places",
+            f"{ENOUGH_FRAMES}, better 10 to 30 from several places"
         )
 
 
-def _examine_frames(frames: Sequence[Frame], rig: Rig, findings: list[Finding]) -> list[Frame]:
-    """The frames whose clouds can be read, with findings about clouds and images."""
+def _examine(
+    data: Dataset, found: _Found, pictures: Path | None
+) -> tuple[dict[str, int], list[Path]]:
+    """The points in view of each camera, and the pictures; of images and clouds as matched."""
+    found["error"] += find_same_images(data, data.rig)
+    data = hide_burnt_in(data, data.rig)
+    found["warning"] += describe_burnt_in(data)
+    choice = choose_frames(data, data.rig, MOST_FRAMES)
+    found["note"] += [choice.text] if choice.text else []
+    readable = _examine_frames(choice.dataset.frames, data.rig, found)
+    if not readable:
+        return {}, []
+    frame = readable[len(readable) // 2]
+    cloud = frame.load_cloud()
+    seen = count_points_in_view(data.rig, cloud)
+    _examine_places(choice.dataset, max(seen, key=seen.__getitem__), cloud, found)
+    _examine_guess(choice.dataset, frame, seen, found)
+    if pictures is None or found["error"]:
+        return seen, []
+    guess = {name: [camera] for name, camera in data.rig.cameras.items()}
+    return seen, write_overlays(frame, guess, pictures)
+
+
+def _examine_frames(frames: Sequence[Frame], rig: Rig, found: _Found) -> list[Frame]:
+    """The frames whose clouds can be read; what is wrong with clouds and images is found."""
     read = map_on_cores(_examine_frame, frames, [rig] * len(frames))
     for source in ("", *rig.cameras):
-        problems = [found[source] for found, _ in read if source in found]
+        problems = [of_frame[source] for of_frame, _ in read if source in of_frame]
         if problems:
             others = f"; {len(problems) - 1} more of its frames have errors" if problems[1:] else ""
-            findings.append(Finding("error", problems[0] + others))
-    warnings = [
-        describe_brightness(name, [means[name] for _, means in read if name in means])
-        for name in rig.cameras
-    ]
-    findings += [Finding("warning", text) for text in warnings if text]
-    points = (int(measured.get("", 0)) for _, measured in read)
-    findings += [Finding("note", line) for line in describe_thinned(points)]
+            found["error"].append(problems[0] + others)
+    levels = {n: [means[n] for _, means in read if n in means] for n in rig.cameras}
+    found["warning"] += filter(None, map(describe_brightness, levels, levels.values()))
+    found["note"] += describe_thinned(int(measured.get("", 0)) for _, measured in read)
     readable = [f for f, (problems, _) in zip(frames, read, strict=True) if "" not in problems]
     sources = {"cloud": [frame.cloud_path for frame in readable]}
     sources |= {f"image of {n}": [f.image_paths[n] for f in readable] for n in rig.cameras}
     for what, paths in sources.items():
         hashes = zip((f.name for f in readable), map_on_cores(hash_source, paths), strict=True)
-        if text := describe_repeats(what, hashes):
-            findings.append(Finding("warning", text))
+        found["warning"] += filter(None, [describe_repeats(what, hashes)])
     return readable
 
 
@@ -207,40 +205,36 @@ def _examine_frame(frame: Frame, rig: Rig) -> tuple[dict[str, str], dict[str, fl
     return problems, measured
 
 
-def _examine_places(data: Dataset, camera: str, cloud: NDArray[np.float32]) -> Iterator[Finding]:
+def _examine_places(data: Dataset, camera: str, cloud: NDArray[np.float32], found: _Found) -> None:
     """How many places the frames are of, as a calibration counts them; and whether some repeat."""
     try:
         places = find_places(data, data.rig, camera)
         stops = find_stationary_frames(data, data.rig)
     except (CalibrationError, OSError):  # which is a finding already
         return
-    yield Finding("note", describe_places(as_groups(places)))
+    found["note"].append(describe_places(as_groups(places)))
     if find_up(cloud, data.rig.T_camera_lidar.values()) is None:
-        yield Finding("note", UNKNOWN_UP)
+        found["note"].append(UNKNOWN_UP)
     if stops:
         names = {frame.index: frame.name for frame in data.frames}
         most = max(stops, key=len)
         count = len(data.frames) - sum(len(stop) - 1 for stop in stops)
-        yield Finding(
-            "warning",
+        found["warning"].append(
             f"{len(data.frames)} frames count as {count}: the vehicle stands, as in {len(most)} "
             f"frames from {names[most[0]]} to {names[most[-1]]}; {ENOUGH_FRAMES} are needed for an "
-            "error bar of their own",
+            "error bar of their own"
         )
 
 
-def _examine_guess(
-    data: Dataset, cloud_of: tuple[Frame, NDArray[np.float32]], seen: Mapping[str, int]
-) -> Iterator[Finding]:
+def _examine_guess(data: Dataset, frame: Frame, seen: Mapping[str, int], found: _Found) -> None:
     """Impossible values, cameras that see no point at the guess, and overlapping cameras."""
-    frame, cloud = cloud_of
-    doubts = find_doubts(data.rig, frame, cloud)
-    intended = explain_guess(data, data.rig, cloud)
-    yield from [Finding("error", intended)] if intended else []
-    yield from (Finding("error", text) for text in describe_out_of_view(seen))
-    yield from (Finding("warning", text) for text in doubts)
-    for name, count in seen.items():
-        yield Finding("note", f"{name}: {count} of {len(cloud)} points lie in the image")
+    cloud = frame.load_cloud()
+    found["warning"] += find_doubts(data.rig, frame, cloud)
+    found["error"] += filter(None, [explain_guess(data, data.rig, cloud)])
+    found["error"] += describe_out_of_view(seen)
+    found["note"] += [
+        f"{n}: {of} of {len(cloud)} points lie in the image" for n, of in seen.items()
+    ]
     if len(data.rig.cameras) > 1:
         pairs = ", ".join(f"{a} and {b}" for a, b in overlapping_pairs(data.rig, cloud)) or "none"
-        yield Finding("note", f"cameras that see the same by the guess: {pairs}")
+        found["note"].append(f"cameras that see the same by the guess: {pairs}")

@@ -24,7 +24,7 @@ MAX_YAML_BYTES = 8 * 2**20
 
 
 def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
-    """Write a temporary file beside ``path`` with ``write``, then rename it in one step.
+    """Write a file of another folder with ``write``, then move it to ``path`` in one step.
 
     A crash leaves the old file or the new one, never half of one.
 
@@ -32,28 +32,15 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
         FileError: if there is no place for it.
         OSError: if it cannot be written; with the path.
     """
-    require_place_for_file(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = None
-    try:
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=_PREFIX, suffix=path.suffix)
-        os.close(handle)
-        temporary = Path(name)
-        write(temporary)
-        with temporary.open("rb+") as file:
-            os.fsync(file.fileno())
-        umask = os.umask(0)
-        os.umask(umask)
-        temporary.chmod(0o666 & ~umask)
-        temporary.replace(path)
-        sync_to_disk(path.parent)
-    except OSError as error:
-        if error.filename and not str(error.filename).startswith(f"{path.parent}/.writing-"):
-            raise  # of another file, which is read
-        raise cannot_write(path, error) from error
-    finally:
-        if temporary is not None:
-            temporary.unlink(missing_ok=True)
+    require_new_file(path, force=True)
+    with written_together(path.parent, last=path.name) as new:
+        try:
+            write(new / path.name)
+            sync_to_disk(new / path.name)
+        except OSError as error:
+            if error.filename and not str(error.filename).startswith(str(new)):
+                raise  # of another file, which is read
+            raise cannot_write(path, error) from error
 
 
 def cannot_write(path: Path, error: Exception, number: int | None = None) -> OSError:
@@ -65,27 +52,18 @@ def cannot_write(path: Path, error: Exception, number: int | None = None) -> OSE
     return OSError(number, f"cannot be written ({reason}); {remedy}", str(path))
 
 
-def require_place_for_file(path: Path, *suffixes: str) -> None:
+def require_new_file(path: Path, *suffixes: str, force: bool = False) -> None:
     """Check, before hours of work, that a file with one of the suffixes can be written.
 
     Raises:
-        FileError: if it is a folder, if a folder above it is a file or not writable, or if it ends
-            in none of the suffixes.
+        FileError: if it is a folder, if a folder above it is a file or not writable, if it ends in
+            none of the suffixes, or if it is there, without force.
     """
     if suffixes and path.suffix not in suffixes:
         raise FileError(path, f"the name of what is written must end in {' or '.join(suffixes)}")
     if path.is_dir():
         raise FileError(path, "is a folder, expected the name of a file to write")
     require_place_for_folder(path.parent)
-
-
-def require_new_file(path: Path, *suffixes: str, force: bool = False) -> None:
-    """Check, before hours of work, that a file can be written and, without force, is not there.
-
-    Raises:
-        FileError: as of :func:`require_place_for_file`, or if it is there.
-    """
-    require_place_for_file(path, *suffixes)
     if os.path.lexists(path) and not force:
         raise FileError(path, "is there already; choose another name, or replace it with --force")
 
@@ -216,10 +194,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
     Raises:
         FileError: if the file is missing, too large, not YAML, or not a mapping.
     """
-    require_file(path)
-    if path.stat().st_size > MAX_YAML_BYTES:
-        raise FileError(path, f"{path.stat().st_size} bytes is too large for a YAML file")
-    return parse_yaml(read_text(path), path)
+    return parse_yaml(_read_small(path, "YAML"), path)
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -228,15 +203,19 @@ def read_json(path: Path) -> dict[str, Any]:
     Raises:
         FileError: if the file is missing, too large, not JSON, or no object.
     """
-    if require_file(path).stat().st_size > MAX_YAML_BYTES:
-        raise FileError(path, f"{path.stat().st_size} bytes is too large for a JSON file")
     try:
-        content = json.loads(read_text(path))
+        content = json.loads(_read_small(path, "JSON"))
     except (ValueError, RecursionError) as error:
         raise FileError(path, f"is not valid JSON: {error}") from error
     if not isinstance(content, dict):
         raise FileError(path, f"holds {describe_value(content)}, expected an object {{...}}")
     return content
+
+
+def _read_small(path: Path, kind: str) -> str:
+    if (size := require_file(path).stat().st_size) > MAX_YAML_BYTES:
+        raise FileError(path, f"{size} bytes is too large for a {kind} file")
+    return read_text(path)
 
 
 def read_text(path: Path) -> str:
@@ -301,16 +280,6 @@ def checked_model(model: type[Model], content: Any, path: Path | str) -> Model:
         return model.model_validate(content)
     except ValidationError as error:
         raise FileError(path, describe(error)) from error
-
-
-def load_model(model: type[Model], path: Path | str | None, **given: Any) -> Model:
-    """A pydantic model from a YAML file, by default (None) without one; given values count first.
-
-    Raises:
-        FileError: if the file is missing, has an unknown key or a wrong value.
-    """
-    content = {} if path is None else read_yaml(Path(path))
-    return checked_model(model, {**content, **given}, path or model.__name__)
 
 
 _DECIMAL_COMMA = re.compile(r"[-+]?[0-9]+,[0-9]+(e[-+]?[0-9]+)?")

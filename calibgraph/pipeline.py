@@ -14,15 +14,16 @@ from collections.abc import Collection
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from calibgraph.arrays import Array
-from calibgraph.elsewhere import go_on_elsewhere
 from calibgraph.io.clouds import describe_thinned
 from calibgraph.io.dataset import Dataset, load_dataset
 from calibgraph.io.tables import load_correspondences
-from calibgraph.matching.named import find_matcher, is_table
+from calibgraph.matching.named import is_table
+from calibgraph.matching.run import MatchingRun
 from calibgraph.model.calibration import Calibration, Later
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.clock import odd_motions, unused_times
@@ -32,7 +33,13 @@ from calibgraph.model.lens import with_sigmas
 from calibgraph.model.rig import Lidar, Rig
 from calibgraph.parallel import Threads, with_own_threads
 from calibgraph.progress import Progress, Stopwatch, no_progress
-from calibgraph.rounds import AnyMatcher, Datasets, match_in_rounds, refine_with_camera_pairs
+from calibgraph.rounds import (
+    AnyMatcher,
+    Datasets,
+    go_on_elsewhere,
+    match_in_rounds,
+    refine_with_camera_pairs,
+)
 from calibgraph.solver.joint import solve_joint
 from calibgraph.trust.assess import assess, assess_run
 from calibgraph.trust.evidence import Checks, Evidence
@@ -41,12 +48,7 @@ from calibgraph.trust.inputs import registered_twists
 from calibgraph.trust.lens_checks import asks_offset
 from calibgraph.trust.probability import STRUCTURE, TABLES, judge
 from calibgraph.trust.solution_checks import residuals_of, weaknesses
-from calibgraph.vehicle.joined import (
-    JoinedMatcher,
-    join_clouds,
-    joint_covariance,
-    place_by_cameras,
-)
+from calibgraph.vehicle.joined import join_clouds, joint_covariance, place_by_cameras
 from calibgraph.vehicle.rig import LidarResult, calibrate_rig_lidars
 
 _log = logging.getLogger(__name__)
@@ -85,41 +87,27 @@ def calibrate(
         CorrespondenceError: if a camera gets too few correspondences.
         ValueError: if the matcher is unknown.
     """
-    report, watch = progress or no_progress, Stopwatch()
+    config, report = config or Config(), progress or no_progress
     data = dataset if isinstance(dataset, Dataset) else load_dataset(dataset, rig)
-    rig, lidars = (rig if rig and data is dataset else data.rig), None
-    config, joined = config or Config(), ""
-    if rig.other_lidars:
-        has_clouds = bool(rig.cameras) and not is_table(matcher)
-
-        def alone(data: Dataset, rig: Rig) -> Calibration:
-            return calibrate(
-                data, rig, matcher, config, terms=terms, time_limit_s=time_limit_s,
-                progress=progress,
-            )  # fmt: skip
-
-        with watch("lidars"):
-            place = partial(place_by_cameras, alone, data, rig) if has_clouds else None
-            lidars = calibrate_rig_lidars(data, rig, config, place=place, progress=report)
-            if has_clouds:
-                data, joined = join_clouds(data, rig, lidars.poses, config.tolerance)
-        if joined:
-            _log.info(joined)
-            matcher = JoinedMatcher(find_matcher(matcher, seed=config.seed), lidars.poses)
-    if lidars is not None and not rig.cameras:
+    rig = rig if rig and data is dataset else data.rig
+    limits: Any = {"terms": terms, "time_limit_s": time_limit_s, "progress": report}
+    watch = Stopwatch()
+    if not rig.other_lidars:
+        return _finish(match_in_rounds(data, rig, matcher, config, **limits))[0]
+    with watch("lidars"):
+        data, lidars, joined = find_lidars(data, rig, matcher, config, **limits)
+    if rig.cameras:
+        result, by_lidars = _finish(match_in_rounds(data, rig, matcher, config, **limits))
+    else:
         with watch("hash_inputs"):
-            hashes = hash_inputs(data)
-        result = replace(
-            _without_cameras(rig, config, terms),
-            inputs=hashes,
-            frames=tuple(frame.entry() for frame in data.frames),
-            timings_s=watch.seconds,
-        )
-        return _with_lidars(result, lidars, np.empty((0, 0)), "")
+            result, by_lidars = _without_cameras(data, rig, config, terms), np.empty((0, 0))
+    result = replace(result, timings_s={**watch.seconds, **result.timings_s})
+    return _with_lidars(result, lidars, by_lidars, joined)
+
+
+def _finish(run: MatchingRun) -> tuple[Calibration, Array]:
+    """The calibration of a run's cameras, and :attr:`Solution.by_lidars` of it."""
     with Threads(1) as beside:
-        run = match_in_rounds(                                   # match -> solve_joint, in rounds
-            data, rig, matcher, config, terms=terms, time_limit_s=time_limit_s, progress=report
-        )  # fmt: skip
         if asks_offset(run):
             beside.submit(registered_twists, run.dataset)  # which its checks wait for
         run = refine_with_camera_pairs(run)  # what cameras see in common
@@ -131,7 +119,7 @@ def calibrate(
             checks, record = assess_run(run, evidence)
     for line in thinned:
         _log.warning(line)
-    report("done", 1, 1)
+    run.progress("done", 1, 1)
     table = run.correspondences
     result = replace(
         to_calibration(evidence, checks),
@@ -140,18 +128,39 @@ def calibrate(
         rounds=run.rounds,
         warnings=(*run.warnings, *thinned),
         inputs=dict(run.hashes),
-        timings_s={**watch.seconds, **run.watch.seconds},
+        timings_s=run.watch.seconds,
     )
-    return (
-        result if lidars is None else _with_lidars(result, lidars, run.solution.by_lidars, joined)
-    )
+    return result, run.solution.by_lidars
 
 
-def _without_cameras(rig: Rig, config: Config, terms: Terms) -> Calibration:
+def find_lidars(
+    data: Dataset, rig: Rig, matcher: AnyMatcher, config: Config, *, terms: Terms = "full",
+    time_limit_s: float | None = None, progress: Progress,
+) -> tuple[Dataset, LidarResult, str]:  # fmt: skip
+    """The LiDARs of a rig; the dataset, their clouds joined where cameras gain, and why in a line.
+
+    Arguments as of :func:`calibrate`. Those that share too little are placed by its cameras.
+    """
+    has_clouds = bool(rig.cameras) and not is_table(matcher)
+    alone = partial(
+        calibrate, matcher=matcher, config=config, terms=terms, time_limit_s=time_limit_s,
+        progress=progress,
+    )  # fmt: skip
+    place = partial(place_by_cameras, alone, data, rig) if has_clouds else None
+    lidars, joined = calibrate_rig_lidars(data, rig, config, place=place, progress=progress), ""
+    if has_clouds:
+        data, joined = join_clouds(data, rig, lidars.poses, config.tolerance)
+    if joined:
+        _log.info(joined)
+    return data, lidars, joined
+
+
+def _without_cameras(data: Dataset, rig: Rig, config: Config, terms: Terms) -> Calibration:
     """The result of a rig without cameras, before its LiDARs."""
     return Calibration(
         rig=rig, initial_rig=rig, covariance={}, joint_covariance=np.empty((0, 0)),
         camera_verdicts={}, residuals={}, counts={}, timings_s={}, terms=terms, config=config,
+        inputs=hash_inputs(data), frames=tuple(frame.entry() for frame in data.frames),
     )  # fmt: skip
 
 
@@ -161,7 +170,7 @@ def _with_lidars(
     """The result with the LiDARs beside the cameras, and in one covariance with them."""
     cameras, joint = result.joint_covariance, None
     if cameras is not None:
-        joint = joint_covariance(cameras, by_lidars, found.poses)
+        joint = joint_covariance(cameras, by_lidars, found.poses.joint_covariance, found.poses.root)
     T, bars = found.poses.T_base_lidar, found.poses.covariance
     lidars = {
         name: Lidar(T_base_lidar=T[name], covariance=bars[name]) if name in bars else Lidar()

@@ -1,19 +1,23 @@
-"""The rounds: match, solve, match again from the estimate; then once from a displaced start.
+"""The rounds: match, solve, match again from the estimate; then from other starts.
 
 The paper matches once and solves once. A local matcher sees only what is near, so it starts
-coarse and is run again from every better estimate. What cameras see in common comes last.
+coarse and is run again from every better estimate. Rounds from other starts, a displaced one and
+those of :func:`go_on_elsewhere`, show whether there is a better end. What cameras see in common
+comes last.
 """
 
 import logging
 import math
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
+import gtsam
 import numpy as np
 
+from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError, CorrespondenceError
 from calibgraph.io.dataset import Dataset, keep_frames, load_dataset
 from calibgraph.matching.burnt_in import hide_burnt_in
@@ -46,7 +50,7 @@ from calibgraph.matching.same_images import require_different_images
 from calibgraph.matching.structure.pose_search import are_same_pose
 from calibgraph.model.config import Config, Terms
 from calibgraph.model.correspondences import Correspondences, concatenate
-from calibgraph.model.geometry import invert
+from calibgraph.model.geometry import invert, pose_difference
 from calibgraph.model.lens import LensEstimate, change_of_lens, unsettled
 from calibgraph.model.metrics import perturb
 from calibgraph.model.places import Places, as_groups
@@ -55,6 +59,7 @@ from calibgraph.progress import Progress, Stopwatch
 from calibgraph.solver.joint import add_camera_pairs, solve_joint, solve_without_failing
 from calibgraph.solver.solution import Solution
 from calibgraph.trust.conventions import likely_intended_guess
+from calibgraph.trust.evidence import Evidence, gather_of_run
 from calibgraph.trust.inputs import check_inputs, describe_copies
 from calibgraph.trust.matcher_checks import REMATCH_DEG, REMATCH_M, check_moves, compare_ends
 from factors.columns import CLOCK
@@ -64,6 +69,8 @@ AnyMatcher = Matcher | Correspondences | Path | str
 
 _log = logging.getLogger(__name__)
 
+_TIMES = 3  # at most: a posterior that its prior cuts off shows the way, not the end
+_STARTS = 4  # each time, at most
 _STANDS, _REPEATS = 0.5, 4
 """Change of a lens or clock, in standard deviations, from which the last round is repeated; how
 often. It is also repeated while it moves a camera that is found beyond what a PASS allows."""
@@ -200,12 +207,9 @@ def rematch(run: MatchingRun, *, confirmed: bool = False) -> MatchingRun:
         run = replace(run, rematch={name: (T, ends[name]) for name, T in ended.items()})
         lost = {*findings.missed, *again.solution.held}
         found = [(name,) for name in findings.z_score if name not in lost]
-        better = better_cameras(run, again, found, ratio=_BETTER)
-        if not better:
-            return run
-        apart = (check.status for name, check in compare_ends(run) if name in better)
-        far = "FAIL" in apart
-        run = with_cameras_of(run, again, better)
+        apart = compare_ends(run)
+        run, better = take_better(run, again, found, ratio=_BETTER)
+        far = any(name in better and check.status == "FAIL" for name, check in apart)
         return rematch(run, confirmed=True) if far and not confirmed else run
     except CorrespondenceError as error:
         both = {name: (T, T) for name, T in ended.items()}
@@ -230,10 +234,10 @@ def follow_neighbours(run: MatchingRun) -> MatchingRun:
     start = run.solution.solved_rig.moved_to({name: placed[fewest][name] for name in astray})
     rounds = (0, *run.matcher.tracking_rounds)
     with suppress(CorrespondenceError):
-        again = run_again(run, start, rounds)
-        if again and (better := better_cameras(run, again, [(name,) for name in astray])):
-            _log.info("beside their neighbours images and clouds agree better: %s", better)
-            return with_cameras_of(run, again, better)
+        if again := run_again(run, start, rounds):
+            run, better = take_better(run, again, [(name,) for name in astray])
+            if better:
+                _log.info("beside their neighbours images and clouds agree better: %s", better)
     return run
 
 
@@ -282,39 +286,37 @@ def _moves_on(rounds: Sequence[RoundSummary], table: Correspondences, config: Co
     return any(name not in missed and check.status != "PASS" for name, check in checks)
 
 
-def better_cameras(
+def take_better(
     run: MatchingRun, again: MatchingRun, groups: Iterable[Sequence[str]], *, ratio: float = 1.0
-) -> list[str]:
-    """The cameras of the groups whose z-scores, added up, are by a ratio higher at a second end."""
+) -> tuple[MatchingRun, list[str]]:
+    """The run with correspondences, starts and summaries of a second end, where it is better.
+
+    Returns:
+        The run; the cameras of the groups whose z-scores, added up, are by a ratio higher there.
+    """
     before, now = (of.correspondences.findings.z_score for of in (run, again))
-    return [
+    names = [
         name
         for group in groups
         if sum(now.get(n, 0.0) for n in group) > ratio * sum(before.get(n, 0.0) for n in group)
         for name in group
     ]
-
-
-def with_cameras_of(run: MatchingRun, again: MatchingRun, names: Collection[str]) -> MatchingRun:
-    """The run with some cameras' correspondences, starts and summaries of a second end."""
+    if not names:
+        return run, names
     parts = [
         (again if name in names else run).correspondences.of_camera(name)
         for name in run.guess.cameras
     ]
-    findings, found = run.correspondences.findings, again.correspondences.findings.z_score
-    z_score = {**findings.z_score, **{name: found[name] for name in names if name in found}}
+    z_score = {**before, **{name: now[name] for name in names if name in now}}
     mixed = concatenate(parts).with_metadata(run.correspondences.metadata)
-    mixed = mixed.with_findings(replace(findings, z_score=z_score))
+    mixed = mixed.with_findings(replace(run.correspondences.findings, z_score=z_score))
     second = again.solution.rig.T_camera_lidar
     start = run.solution.rig.with_lenses_of(run.guess)
     start = start.moved_to({name: second[name] for name in names})
     last = {**run.rounds[-1], **{name: again.rounds[-1][name] for name in names}}
-    return replace(
-        run,
-        correspondences=mixed,
-        solution=solve_joint(start, mixed, run.solution.config, run.solution.terms),
-        rounds=(*run.rounds[:-1], last),
-    )
+    solution = solve_joint(start, mixed, run.solution.config, run.solution.terms)
+    rounds = (*run.rounds[:-1], last)
+    return replace(run, correspondences=mixed, solution=solution, rounds=rounds), names
 
 
 def assign_places(run: MatchingRun) -> MatchingRun:
@@ -381,6 +383,79 @@ def refine_with_camera_pairs(run: MatchingRun) -> MatchingRun:
             return replace(run, solution=add_camera_pairs(solution, matches))
     except (CalibrationError, OSError):  # the checks on images report it
         return run
+
+
+def go_on_elsewhere(run: MatchingRun) -> tuple[MatchingRun, Evidence]:
+    """The run, or one whose rounds have gone on from where images agree better; and its evidence.
+
+    Coarse levels can lead the rounds to a pose a degree off, as over grass and asphalt. There fine
+    levels agree hardly better than by chance, and find no way back. The posterior of the pose by
+    the fine scores covers a degree about the result. If more than half of its mass is elsewhere,
+    its densest samples there, farther apart than the tolerance, are starts of the last rounds.
+    (Their mean may lie between modes, and the densest alone misses the right one.) The end at which
+    the cameras agree best is taken, if it is better than the result.
+
+    The posterior that chose the pose cannot vouch for it: such a camera is WARN at best.
+    """
+    T_first, evidence = run.solution.T_camera_lidar, gather_of_run(run)
+    for _ in range(_TIMES):
+        if run.out_of_time or not run.matcher.tracking_rounds:
+            break
+        found = evidence.posteriors  # of no camera without images, or without a covariance
+        groups = [g for g in evidence.tied if g[0] in found and found[g[0]].share > 1 / 2]
+        after = _go_on(run, evidence, groups, T_first) if groups else None
+        if after is None:
+            break
+        run, evidence = after, gather_of_run(after)
+    return run, evidence
+
+
+def _go_on(
+    run: MatchingRun,
+    evidence: Evidence,
+    groups: Sequence[tuple[str, ...]],
+    T_first: Mapping[str, Array],
+) -> MatchingRun | None:
+    """The run with the groups that agree better at the end of rounds from there; None if none."""
+    samples = {name: found.elsewhere for name, found in evidence.posteriors.items()}
+    modes = {g: _find_modes(samples[g[0]], run.solution.config.tolerance) for g in groups}
+    T, ended, better = run.solution.T_camera_lidar, run, set[str]()
+    with run.watch("match_again"):
+        for number in range(max(map(len, modes.values()))):
+            start = run.solution.solved_rig.moved_to({
+                name: gtsam.Pose3.Expmap(samples[name][found[number]]).matrix() @ T[name]
+                for group, found in modes.items()
+                for name in (group if number < len(found) else ())
+            })  # fmt: skip
+            with suppress(CorrespondenceError):
+                again = run_again(run, start, run.matcher.tracking_rounds[-1:])
+                if again is None:
+                    break
+                ended, names = take_better(ended, again, groups)
+                better.update(names)
+    run.matcher.release()
+    if not better:
+        return None
+    T = ended.solution.T_camera_lidar
+    moved = {name: pose_difference(T_first[name], T[name]) for name in better}
+    _log.info("rounds went on, by deg, cm: %s", moved)
+    # Of these the test from a displaced start was of a pose that is no longer the result.
+    kept = {name: ends for name, ends in run.rematch.items() if name not in better}
+    ended = replace(ended, went_on={**run.went_on, **moved}, rematch=kept)
+    return refine_with_camera_pairs(assign_places(ended))
+
+
+def _find_modes(samples: Array, tolerance: tuple[float, float]) -> list[int]:
+    """Numbers of (n, 6) samples, the densest first, apart from the result and from each other."""
+    numbers, found, last = np.arange(len(samples)), list[int](), np.zeros(6)
+    while len(found) < _STARTS:
+        degrees, cm = np.linalg.norm((samples[numbers] - last).reshape(-1, 2, 3), axis=2).T
+        numbers = numbers[(np.degrees(degrees) > tolerance[0]) | (100 * cm > tolerance[1])]
+        if not len(numbers):
+            break
+        found.append(int(numbers[0]))
+        last = samples[numbers[0]]
+    return found
 
 
 def _driven_between_m(run: MatchingRun, pair: tuple[str, str]) -> float:

@@ -25,7 +25,6 @@ from calibgraph import (
     simulate_correspondences,
 )
 from calibgraph.arrays import Array
-from calibgraph.elsewhere import go_on_elsewhere
 from calibgraph.io.dataset import keep_frames
 from calibgraph.matching.run import MatchingRun
 from calibgraph.matching.structure import StructureMatcher
@@ -33,7 +32,12 @@ from calibgraph.model.config import Terms
 from calibgraph.model.geometry import invert, pose_difference, relative_transform
 from calibgraph.model.verdict import TOLERANCE, WENT_ON, Check
 from calibgraph.progress import Progress, no_progress
-from calibgraph.rounds import follow_neighbours, match_in_rounds, refine_with_camera_pairs
+from calibgraph.rounds import (
+    follow_neighbours,
+    go_on_elsewhere,
+    match_in_rounds,
+    refine_with_camera_pairs,
+)
 from calibgraph.solver.joint import solve_joint, solve_without_failing
 from calibgraph.trust import evidence
 from calibgraph.trust.matcher_checks import compare_ends, going_on_checks

@@ -31,8 +31,8 @@ from calibgraph.matching.structure.schedule import LEVELS
 from calibgraph.matching.structure.score_kernel import pad, score_windows
 from calibgraph.matching.structure.shift_scores import select_windows
 from calibgraph.matching.structure.visibility import find_places
-from calibgraph.matching.structure.window_kernels import FEATURES
 from calibgraph.matching.structure.window_weights import (
+    FEATURES,
     LARGEST,
     PACKAGE_FILE,
     WindowNetwork,
@@ -116,11 +116,11 @@ def sample_of(dataset: Dataset, rig: Rig, of: str, frames: int = 4) -> Sample:
             viewpoint_m = cloud.viewpoint_lidar_m(camera)
             reach = min(REACH, round(LEVEL.reach_rad * camera.lens.pixels_per_rad * scale.max()))
             reach = max(reach, 3)
-            places = find_places(windows.rays_m, viewpoint_m, camera, scale)
+            places = find_places(windows["rays_m"], viewpoint_m, camera, scale)
             margins = ((0, 0), (REACH - reach,) * 2, (REACH - reach,) * 2)
             grids = score_each(image, places, windows, reach)
             scores.append(np.pad(grids, margins, constant_values=np.nan))
-            features.append(windows.features)
+            features.append(windows["features"])
     return Sample(np.concatenate(features), torch.tensor(np.concatenate(scores)))
 
 
@@ -202,10 +202,11 @@ def damped(scores: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
 
 def score_each(image: np.ndarray, places: np.ndarray, windows: Windows, reach: int) -> np.ndarray:
     """(w, s, s) scores of every window by itself, by shift [v, u] up to a reach in steps."""
-    count, side = len(windows.counts), 2 * reach + 1
+    count, side = len(windows), 2 * reach + 1
     grids = np.zeros((count, side, side), np.float32)
     group, first = np.arange(count, dtype=np.int32), np.array([-reach, -reach])
-    score_windows(pad(image), places, windows.counts, windows.basis, group, first, True, grids)
+    of_windows = windows["count"], windows["basis"]
+    score_windows(pad(image), places, *of_windows, group, first, True, grids)
     return grids
 
 

@@ -6,7 +6,6 @@ from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from calibgraph.arrays import Array
 from calibgraph.audit.judgement import (
@@ -29,7 +28,7 @@ from calibgraph.io.frame import hash_source
 from calibgraph.io.rigs import load_rig
 from calibgraph.matching.burnt_in import describe_burnt_in, hide_burnt_in
 from calibgraph.matching.frame_choice import CANDIDATES, without_copies
-from calibgraph.matching.named import find_matcher, is_table
+from calibgraph.matching.named import find_matcher
 from calibgraph.matching.protocol import FullMatcher
 from calibgraph.matching.run import MatchingRun
 from calibgraph.matching.same_images import require_different_images
@@ -60,7 +59,7 @@ from calibgraph.trust.lens_checks import intrinsics_checks
 from calibgraph.trust.matcher_checks import last_round_checks, matcher_checks
 from calibgraph.trust.solution_checks import estimate_checks, outlier_frame_checks
 from calibgraph.trust.thresholds import threshold
-from calibgraph.vehicle.joined import JoinedMatcher, join_clouds
+from calibgraph.vehicle.joined import joint_covariance
 
 _log = logging.getLogger(__name__)
 
@@ -120,15 +119,11 @@ def check(
     same_recording, verdict = (False, None) if isinstance(rig, Rig) else provenance(rig, given)
     measured = list[Measured]()
     if deployed.other_lidars:
-        sensors = len(deployed.cameras) + len(deployed.other_lidars)
         with watch("lidars"):
-            lidars, poses = measure_lidars(
-                deployed, given, Config(seed=seed), tolerance, sensors=sensors, progress=report
+            given, lidars = measure_lidars(
+                deployed, given, Config(seed=seed), tolerance, matcher=matcher, progress=report
             )
             measured.append(lidars)
-            if poses is not None and not is_table(matcher):
-                given, line = join_clouds(given, deployed, poses, Config().tolerance)
-                full = FullMatcher(JoinedMatcher(full, poses)) if line else full
     with watch("choose_frames"):
         data = _open(given, deployed, full) if deployed.cameras else given
     if deployed.cameras:
@@ -184,9 +179,13 @@ def _measure_cameras(
     finally:
         matcher.release()
     trusted = not any(doubts.values()) and all(each.sigma is not None for each in cameras.values())
-    deviations = [deviation_of(evidence, name) for name in cameras]
-    poses = [*deployed.T_camera_lidar.values()]
-    return Measured(cameras, deviations, evidence.joint_covariance if trusted else None, poses)
+    return Measured(
+        cameras,
+        [deviation_of(evidence, name) for name in cameras],
+        evidence.joint_covariance if trusted else None,
+        -evidence.solution.by_lidars,
+        [*deployed.T_camera_lidar.values()],
+    )
 
 
 def _judge_lidar(measured: Sequence[Measured], tolerance: Array) -> CameraAudit | None:
@@ -195,15 +194,17 @@ def _judge_lidar(measured: Sequence[Measured], tolerance: Array) -> CameraAudit 
     None where none is WRONG, or with a single one, which cannot be told from the LiDAR; and where
     a measurement cannot be trusted.
     """
-    covariances = [each.covariance for each in measured if each.covariance is not None]
+    known = [(of.covariance, of.by_errors) for of in measured if of.covariance is not None]
+    if len(known) < len(measured):
+        return None
     statuses = [audit.status for each in measured for audit in each.audits.values()]
-    return None if len(covariances) < len(measured) else find_lidar_motion(
+    return find_lidar_motion(
         np.concatenate([one for each in measured for one in each.deviations]),
-        np.asarray(block_diag(*covariances)),
+        known[0][0] if len(known) == 1 else joint_covariance(*known[0], *known[1]),
         [T for each in measured for T in each.poses],
         moved=[k for k, status in enumerate(statuses) if status == "WRONG"],
         quantile=Limits.of(np.inf, FALSE_ALARM_RATE / len(statuses), tolerance).axis[0],
-    )  # fmt: skip
+    )
 
 
 def _doubts(run: MatchingRun, evidence: Evidence, progress: Progress) -> dict[str, str]:

@@ -29,7 +29,7 @@ from calibgraph.audit.result import ORDER, CameraAudit, lidar_summary
 from calibgraph.errors import CalibrationError
 from calibgraph.io.calibrations import load_calibration
 from calibgraph.model.calibration import Calibration
-from calibgraph.model.geometry import invert, pose_rows
+from calibgraph.model.geometry import invert, rows_of_poses
 from calibgraph.model.result_files import CALIBRATION_FILE
 from calibgraph.model.rig import IMAGE_TIMES
 from calibgraph.model.verdict import COMMON_ERROR
@@ -290,8 +290,7 @@ def _joint_covariance(
             continue
         if result.joint_covariance is None:
             return None
-        order = [*result.joint_names]
-        columns = np.concatenate([np.r_[pose_rows(order.index(name))] for name in rows])
+        columns = rows_of_poses([*rows], result.joint_names)
         gain = block_diag(*parts) @ block_diag(*[_to_own_axes(result, name) for name in rows])
         whole += gain @ result.joint_covariance[np.ix_(columns, columns)] @ gain.T
     return whole if np.linalg.eigvalsh(whole)[0] > 0 else None

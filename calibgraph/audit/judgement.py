@@ -192,12 +192,14 @@ class Measured(NamedTuple):
         audits: per sensor.
         deviations: (6,) of each, as of an audit.
         covariance: (6 k, 6 k) of all; None if one of them cannot be trusted.
+        by_errors: (6 k, e) of the deviations by a standard deviation of errors of LiDARs' poses.
         poses: (4, 4) T_camera_lidar of each as deployed; another LiDAR counts as a camera.
     """
 
     audits: Mapping[str, CameraAudit]
     deviations: Sequence[Array] = ()
     covariance: Array | None = None
+    by_errors: Array = np.empty((0, 0))
     poses: Sequence[Array] = ()
 
 

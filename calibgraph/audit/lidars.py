@@ -25,18 +25,20 @@ from calibgraph.io.dataset import Dataset
 from calibgraph.model.config import Config
 from calibgraph.model.geometry import invert, twist_between
 from calibgraph.model.rig import Rig
+from calibgraph.pipeline import find_lidars
 from calibgraph.progress import Progress
-from calibgraph.vehicle.lidars import PLACE_FREEDOM, LidarPoses
-from calibgraph.vehicle.rig import LidarResult, calibrate_rig_lidars
+from calibgraph.rounds import AnyMatcher
+from calibgraph.vehicle.lidars import PLACE_FREEDOM
+from calibgraph.vehicle.rig import LidarResult
 
 _LEAST_FREEDOM = 3.0  # of one place, where the size is a prior
 _UNUSABLE = ("lidar_matched", "lidar_start")  # kinds of checks
 
 
 def measure_lidars(
-    deployed: Rig, data: Dataset, config: Config, tolerance: Array, *, sensors: int,
-    progress: Progress,
-) -> tuple[Measured, LidarPoses | None]:  # fmt: skip
+    deployed: Rig, data: Dataset, config: Config, tolerance: Array, *,
+    matcher: AnyMatcher = "structure", progress: Progress,
+) -> tuple[Dataset, Measured]:  # fmt: skip
     """Measure the LiDARs of a rig again, and compare them with where they are deployed.
 
     Args:
@@ -44,11 +46,11 @@ def measure_lidars(
         data: its frames have their clouds.
         config: of the verdict of what is measured.
         tolerance: (2,) of a turn [rad] and a shift [m].
-        sensors: number of all that are compared, over which false alarms are shared.
+        matcher: of cameras, which place LiDARs that share too little.
         progress: called as the work goes on.
 
     Returns:
-        The comparison of those but the base; their poses, None if they could not be measured.
+        The dataset, its clouds joined where cameras gain; and the LiDARs but the base.
 
     Raises:
         RigError: if a LiDAR has no pose.
@@ -60,20 +62,25 @@ def measure_lidars(
             f"lidars.{missing[0]}: has no T_base_lidar, so that there is no pose to compare; "
             "calibrate it first"
         )
-    rig = deployed.model_copy(update={"vehicle": None})
+    rig, sensors = deployed.model_copy(update={"vehicle": None}), len(deployed.cameras) + len(names)
     try:
-        found = calibrate_rig_lidars(data, rig, config, progress=progress)
+        data, found, _ = find_lidars(data, rig, matcher, config, progress=progress)
     except CalibrationError as error:
         if error.__class__ is not CalibrationError:  # of the data
             raise
         audits = {name: CameraAudit("CANNOT TELL", str(error)) for name in names}
-        return Measured(audits), None
+        return data, Measured(audits)
     T_lidar_base = [invert(known[name]) for name in names]
     now = found.poses.T_base_lidar
     deviations = [
         twist_between(T, invert(now[name])) for name, T in zip(names, T_lidar_base, strict=True)
     ]
-    covariance = _covariance(found, deployed)
+    turns = [deployed.T_base_lidar[name][:3, :3].T for name in names for _ in range(2)]
+    to_own = block_diag(*turns)
+    covariance, by_errors = (
+        to_own @ _covariance(found, deployed) @ to_own.T,
+        to_own @ found.poses.root,
+    )
     freedom = freedom_of_places(found.poses.places, len(names))
     limits = Limits.of(freedom, FALSE_ALARM_RATE / sensors, tolerance)
     audits = {}
@@ -88,7 +95,7 @@ def measure_lidars(
         audits[name] = CameraAudit(
             status, reason, deviations[row], sigma, detectable(sigma, limits.confident)
         )
-    return Measured(audits, deviations, covariance, T_lidar_base), found.poses
+    return data, Measured(audits, deviations, covariance, by_errors, T_lidar_base)
 
 
 def freedom_of_places(places: int, lidars: int) -> float:
@@ -97,15 +104,11 @@ def freedom_of_places(places: int, lidars: int) -> float:
 
 
 def _covariance(found: LidarResult, deployed: Rig) -> Array:
-    """(6 k, 6 k) of the deviations: of the measurement and, if it is known, of what is deployed."""
-    names, joint = deployed.other_lidars, found.poses.joint_covariance.copy()
-    for row, name in enumerate(names):
-        own = (deployed.lidars or {})[name].covariance
-        if own is not None:
-            joint[6 * row : 6 * row + 6, 6 * row : 6 * row + 6] += own
-    turns = [deployed.T_base_lidar[name][:3, :3].T for name in names for _ in range(2)]
-    to_own = block_diag(*turns)
-    return np.asarray(to_own @ joint @ to_own.T)
+    """(6 k, 6 k) of all poses: of the measurement and, if it is known, of what is deployed."""
+    lidars, nothing = deployed.lidars or {}, np.zeros((6, 6))
+    bars = [lidars[name].covariance for name in deployed.other_lidars]
+    known = [nothing if bar is None else bar for bar in bars]
+    return np.asarray(found.poses.joint_covariance + block_diag(*known))
 
 
 def _doubt(found: LidarResult, name: str) -> str:

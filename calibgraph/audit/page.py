@@ -17,7 +17,7 @@ from calibgraph.model.calibration import FRAMES_SENTENCE
 from calibgraph.model.rig import Camera
 from calibgraph.model.summary import Reason
 from calibgraph.report.kit import page_template
-from calibgraph.report.page_overlays import depth_scale, draw_overlays, width_on_page
+from calibgraph.report.pictures import depth_scale, draw_overlays, width_on_page
 from calibgraph.report.tables import make_table
 
 

@@ -19,11 +19,12 @@ from typing import Any, TextIO
 
 import typer
 
-from calibgraph.cli.audit import check, drift
 from calibgraph.cli.calibrate import calibrate, match, solve, track
-from calibgraph.cli.inspect import doctor, evaluate, export, perturb, report, simulate
+from calibgraph.cli.inspect import check, doctor, drift, evaluate, export, perturb, report, simulate
 from calibgraph.cli.rig import rig
 from calibgraph.cli.serve import fleet, pick, serve
+from calibgraph.errors import CalibrationError, printable
+from calibgraph.stdout import discard
 
 _INTERRUPTED = 130
 _COLLECT_AFTER = 100_000, 20, 20
@@ -75,8 +76,6 @@ for _command in COMMANDS:
 
 def main() -> None:
     """Run the command line; errors in the data become one line on stderr and exit code 2."""
-    from calibgraph.errors import CalibrationError
-
     os.environ.update(_ONE_THREAD | os.environ)
     gc.set_threshold(*_COLLECT_AFTER)
     atexit.register(gc.freeze)  # at its end Python would look for garbage in all objects: 0.3 s
@@ -106,8 +105,6 @@ def main() -> None:
 
 def _require_utf8(arguments: list[str]) -> None:
     """Check the arguments: results hold the paths of their input, as text."""
-    from calibgraph.errors import CalibrationError
-
     for argument in arguments:
         try:
             argument.encode()
@@ -143,12 +140,10 @@ def _flush(stream: TextIO | None) -> None:
     try:
         stream.flush()
     except OSError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+        discard(stream)
 
 
 def _one_line(error: Exception) -> str:
-    from calibgraph.errors import printable
-
     if isinstance(error, OSError) and error.filename:
         return printable(f"{error.filename}: {error.strerror}")
     text = error.format_message() if hasattr(error, "format_message") else str(error)
@@ -157,8 +152,6 @@ def _one_line(error: Exception) -> str:
 
 def _crash(error: Exception) -> str:
     """An error that no one foresaw, in one line."""
-    from calibgraph.errors import CalibrationError
-
     if isinstance(error, MemoryError):
         why = f" ({error})" if str(error) else ""
         return f"not enough memory{why}; give fewer frames, or smaller files"

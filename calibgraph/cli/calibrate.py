@@ -5,25 +5,21 @@ from __future__ import annotations
 import logging
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import typer
 from typer import Argument, Option
 
+import calibgraph
 from calibgraph.cli import options
 from calibgraph.cli.options import (
-    bag_options_from,
+    bag_settings,
     checked_arguments,
     dataset_from,
     matcher_from,
     time_limit_of,
 )  # fmt: skip
-from calibgraph.cli.terminal import elapsed_s, print_json, print_line, progress_bar, terminal
-
-if TYPE_CHECKING:
-    from calibgraph.io.dataset import Dataset
-    from calibgraph.model.calibration import Calibration
-
+from calibgraph.cli.terminal import elapsed_s, print_line, progress_bar, terminal
+from calibgraph.stdout import print_json, require_stdout
 
 TABLE_SUFFIXES = (".parquet", ".csv")
 
@@ -54,7 +50,6 @@ def calibrate(
 
     keep_freed_memory()
     require_result_folder(out, [*dataset, *_rig_files(rig)])
-    from calibgraph.pipeline import calibrate
     from calibgraph.report.html import write_result
 
     with checked_arguments():
@@ -63,15 +58,15 @@ def calibrate(
             matcher, weights, seed=settings.seed, all_frames=bool(frames or every_s),
             of_cmrnext=rare.of_cmrnext, search_deg=search_deg, search_m=search_m
         )  # fmt: skip
-    bag = bag_options_from(topic, every_s=every_s, motion=motion, **rare.of_bags)
+    bag = bag_settings(config, topic, every_s=every_s, motion=motion)
     data = dataset_from(dataset, rig, frames, bag, interval_s=interval_s)
     with progress_bar() as progress:
-        result = calibrate(
+        result = calibgraph.calibrate(
             data, matcher=chosen, config=settings, terms=rare.terms,
             time_limit_s=time_limit_of(matcher, time_limit_s), progress=progress
         )  # fmt: skip
         result = _warned_of_same_data(result, rig)
-        written = write_result(result, out, data)
+        written = write_result(result, out)
     checks = (check for of in result.camera_verdicts.values() for check in of.checks)
     copies = next((check.value for check in checks if check.name == "copies"), None)
     _print_frames_used(len(result.frames), data, int(copies or 0))
@@ -102,6 +97,7 @@ def match(
     """Find correspondences and write them as a table; exit 1 if a camera was not found."""
     from calibgraph.cli.settings import read_settings
     from calibgraph.files import require_new_file
+    from calibgraph.pipeline import find_lidars
     from calibgraph.rounds import match_in_rounds
 
     require_new_file(out, *TABLE_SUFFIXES, force=force)
@@ -111,10 +107,12 @@ def match(
             matcher, weights, seed=settings.seed, all_frames=bool(frames or every_s),
             of_cmrnext=rare.of_cmrnext, search_deg=search_deg, search_m=search_m
         )  # fmt: skip
-    bag = bag_options_from(topic, every_s=every_s, motion=motion, **rare.of_bags)
+    bag = bag_settings(config, topic, every_s=every_s, motion=motion)
     data = dataset_from(dataset, rig, frames, bag, interval_s=interval_s)
     limit_s = time_limit_of(matcher, time_limit_s)
     with progress_bar() as progress:
+        if data.rig.other_lidars:  # as of calibrate
+            data, *_ = find_lidars(data, data.rig, chosen, settings, progress=progress)
         run = match_in_rounds(data, matcher=chosen, time_limit_s=limit_s, progress=progress)
         run.correspondences.save(out)
     _print_frames_used(len(run.dataset.frames), data, len(run.copies))
@@ -149,7 +147,7 @@ def solve(
     ),
     common_cm: float | None = Option(None, metavar="CM", min=0, help="Likewise, of the position."),
     print_graph: bool = Option(
-        False, "--print-graph", callback=options.require_stdout, help="Print every factor."
+        False, "--print-graph", callback=require_stdout, help="Print every factor."
     ),
     config: options.ConfigFile = None,
     as_json: options.JsonOption = False,
@@ -157,10 +155,7 @@ def solve(
     """Calibrate all cameras jointly from a table of correspondences, with a report."""
     from calibgraph.cli.settings import read_settings
     from calibgraph.files import sha256
-    from calibgraph.io.rigs import load_rig
-    from calibgraph.io.tables import load_camera_matches
     from calibgraph.model.result_files import require_result_folder
-    from calibgraph.pipeline import solve
     from calibgraph.report.html import write_result
 
     matches = [] if camera_matches is None else [camera_matches]
@@ -173,8 +168,10 @@ def solve(
         if print_graph and as_json:
             raise ValueError("--print-graph and --json both print; choose one")
     with progress_bar("solving"), checked_arguments():
-        seen = None if camera_matches is None else load_camera_matches(camera_matches)
-        result = solve(load_rig(rig), correspondences, settings, rare.terms, camera_matches=seen)
+        seen = None if camera_matches is None else calibgraph.load_camera_matches(camera_matches)
+        result = calibgraph.solve(
+            calibgraph.load_rig(rig), correspondences, settings, rare.terms, camera_matches=seen
+        )
         result = replace(result, inputs={str(correspondences): sha256(correspondences)})
         result = _warned_of_same_data(result, rig)
         written = write_result(result, out)
@@ -191,7 +188,9 @@ def _rig_files(rig: Path | None) -> list[Path]:
     return [] if rig is None else [find_rig_file(rig) or rig]
 
 
-def _warned_of_same_data(result: Calibration, rig: Path | None) -> Calibration:
+def _warned_of_same_data(
+    result: calibgraph.Calibration, rig: Path | None
+) -> calibgraph.Calibration:
     """With a warning if what was estimated has a prior that is from the same data."""
     from calibgraph.io.calibrations import stated_result
     from calibgraph.io.rigs import rig_file
@@ -207,7 +206,7 @@ def _warned_of_same_data(result: Calibration, rig: Path | None) -> Calibration:
     return replace(result, warnings=(*result.warnings, text))
 
 
-def _print_frames_used(used: int, data: Dataset, copies: int) -> None:
+def _print_frames_used(used: int, data: calibgraph.Dataset, copies: int) -> None:
     """Print how many frames were matched, unless all were."""
     text = f"{used} of {len(data.frames)} frames"
     if used + copies < len(data.frames):
@@ -218,7 +217,7 @@ def _print_frames_used(used: int, data: Dataset, copies: int) -> None:
         print_line(text)
 
 
-def _print_and_exit(result: Calibration, written: list[Path], *, as_json: bool) -> None:
+def _print_and_exit(result: calibgraph.Calibration, written: list[Path], *, as_json: bool) -> None:
     """Print a result; exit 1 if it is FAIL."""
     if as_json:
         from calibgraph.report.as_json import result_summary
@@ -260,7 +259,6 @@ def track(
     as wide. Tables of `calibgraph match` list them.
     """
     from calibgraph.cli.settings import read_settings
-    from calibgraph.io.rigs import load_rig
     from calibgraph.model.result_files import require_result_folder
     from calibgraph.tracking.command import track
     from calibgraph.tracking.state import require_poses_alone
@@ -269,6 +267,6 @@ def track(
     with checked_arguments():
         settings, _ = read_settings(config, seed=seed)
         require_poses_alone(settings)
-    guess = load_rig(rig)
+    guess = calibgraph.load_rig(rig)
     result, written = track(guess, source, config=settings, out=out, notify=print_line)
     _print_and_exit(result, written, as_json=False)

@@ -1,4 +1,4 @@
-"""The commands report, evaluate, perturb, doctor, export and simulate."""
+"""The commands report, evaluate, check, drift, perturb, doctor, export and simulate."""
 
 from __future__ import annotations
 
@@ -11,10 +11,12 @@ from typing import TYPE_CHECKING
 import typer
 from typer import Argument, Option
 
+import calibgraph
 from calibgraph.cli import options
-from calibgraph.cli.options import bag_settings, checked_arguments
-from calibgraph.cli.terminal import print_json, print_line, progress_bar, terminal
+from calibgraph.cli.options import bag_settings, checked_arguments, dataset_from, matcher_from
+from calibgraph.cli.terminal import elapsed_s, print_line, progress_bar, terminal
 from calibgraph.io.formats import EXPORT_FORMATS
+from calibgraph.stdout import print_json
 
 if TYPE_CHECKING:
     import numpy as np
@@ -30,13 +32,15 @@ def report(
 ) -> None:
     """Show a result as one HTML page that opens without a network."""
     from calibgraph.files import require_new_file
-    from calibgraph.io.calibrations import load_calibration
     from calibgraph.model.result_files import REPORT_FILE
     from calibgraph.report.html import write_report
 
     if out is not None:
         require_new_file(out, ".html", ".htm", force=force)
-    loaded, folder = load_calibration(result), result if result.is_dir() else result.parent
+    loaded, folder = (
+        calibgraph.load_calibration(result),
+        result if result.is_dir() else result.parent,
+    )
     path = write_report(loaded, out or folder / REPORT_FILE)
     print_line(f"{path}: written; the verdict is {loaded.verdict.status}")
 
@@ -51,19 +55,101 @@ def evaluate(
     Of a reference with error bars, as `calibgraph pick` writes it, in standard deviations as well.
     """
     from calibgraph.io.calibrations import stated_result
-    from calibgraph.io.rigs import load_rig, rig_file
-    from calibgraph.model.metrics import evaluate
+    from calibgraph.io.rigs import rig_file
 
     path = rig_file(estimate)
     stated = stated_result(path)
     bars = None if stated is None else stated.error_bars
-    errors = evaluate(load_rig(estimate), load_rig(reference), bars)
+    errors = calibgraph.evaluate(
+        calibgraph.load_rig(estimate), calibgraph.load_rig(reference), bars
+    )
     if as_json:
         print_json(asdict(errors))
     else:
         from calibgraph.report.tables import print_evaluation
 
         print_evaluation(terminal(), errors, path, rig_file(reference))
+
+
+_EXIT_CODES = {"OK": 0, "WRONG": 1, "CHANGED": 1, "CANNOT TELL": 3}
+
+
+def check(
+    *,
+    rig: Path = Argument(..., metavar="RIG", help="The deployed calibration: a result or a rig."),
+    dataset: options.Datasets,
+    tolerance_deg: options.ToleranceDeg = 0.5,
+    tolerance_cm: options.ToleranceCm = 10.0,
+    frames: options.Frames = None,
+    topic: options.Topic = None,
+    motion: options.Motion = None,
+    config: options.ReadingFile = None,
+    seed: options.Seed = 0,
+    out: Path | None = Option(None, metavar="FILE.html", help="The answer as a page."),
+    as_json: options.JsonOption = False,
+    force: options.Force = False,
+) -> None:
+    """Is a deployed calibration still right? Exit 0: all OK, 1: WRONG, 3: the data cannot tell.
+
+    Compares it with images and clouds of a recent recording, per camera, LiDAR and axis. Writes no
+    file but the page, if one is wanted.
+    """
+    from calibgraph.audit.judgement import tolerance_twist
+    from calibgraph.files import require_new_file
+
+    if out is not None:
+        require_new_file(out, ".html", ".htm", force=force)
+    with checked_arguments():
+        tolerance_twist(tolerance_deg, tolerance_cm)
+        matcher = matcher_from("structure", seed=seed, all_frames=frames is not None)
+    data = dataset_from(dataset, rig, frames, bag_settings(config, topic, motion=motion))
+    with progress_bar() as progress:
+        audit = calibgraph.check(
+            rig, data, tolerance_deg=tolerance_deg, tolerance_cm=tolerance_cm,
+            matcher=matcher, seed=seed, progress=progress,
+        )  # fmt: skip
+    if out is not None:
+        calibgraph.write_audit_report(audit, out)
+    if as_json:
+        from calibgraph.audit import audit_summary
+
+        print_json(audit_summary(audit))
+    else:
+        from calibgraph.audit.page import print_audit
+
+        print_audit(terminal(), audit, out, elapsed_s())
+    raise typer.Exit(_EXIT_CODES[audit.status])
+
+
+def drift(
+    results: list[Path] = Argument(
+        ..., metavar="RESULT...", help="Of one rig: their folders, or calibration.yaml files."
+    ),
+    tolerance_deg: options.ToleranceDeg = 0.5,
+    tolerance_cm: options.ToleranceCm = 10.0,
+    own_lenses: bool = Option(
+        False, "--own-lenses", help="Lenses may differ: several vehicles, each with its own."
+    ),
+    as_json: options.JsonOption = False,
+) -> None:
+    """Which of several results of one rig deviates? Exit 0: none, 1: one CHANGED, 3: cannot tell.
+
+    Compares each result with the others that agree, per camera, LiDAR and axis, without a
+    reference: of several days, or of several vehicles. One false alarm in 100 calls.
+    """
+    with checked_arguments():
+        sizes = {"tolerance_deg": tolerance_deg, "tolerance_cm": tolerance_cm}
+        found = calibgraph.drift(results, **sizes, own_lenses=own_lenses)
+    if as_json:
+        from calibgraph.audit import drift_summary
+
+        print_json(drift_summary(found))
+    else:
+        from calibgraph.audit.page import print_drift
+
+        print_drift(terminal(), found)
+        print_line("nothing was written")
+    raise typer.Exit(_EXIT_CODES[found.status])
 
 
 def perturb(
@@ -77,14 +163,12 @@ def perturb(
 ) -> None:
     """Displace every camera at random, T_delta * T_camera_lidar: the paper's initial guesses."""
     from calibgraph.files import require_new_file
-    from calibgraph.io.rigs import load_rig
-    from calibgraph.model.metrics import perturb
 
     require_new_file(out, ".yaml", ".yml", force=force)
-    given = load_rig(rig)
+    given = calibgraph.load_rig(rig)
     with checked_arguments():
         size = {"rotation_deg": rotation_deg, "translation_m": translation_m}
-        displaced = perturb(given, **size, seed=seed, uniform=uniform)
+        displaced = calibgraph.perturb(given, **size, seed=seed, uniform=uniform)
     displaced.save(out)
     print_line(f"{out}: {len(displaced.cameras)} cameras displaced (seed {seed})")
 
@@ -103,16 +187,14 @@ def doctor(
     as_json: options.JsonOption = False,
 ) -> None:
     """Examine a dataset before it is calibrated: what is there, what to fix; exit 1 if anything."""
-    from calibgraph.doctor import diagnose
     from calibgraph.files import require_own_folder, write_text
-    from calibgraph.io.rigs import load_rig
 
     if out is not None:
         require_own_folder(out, dataset)
     with checked_arguments(), progress_bar("reading"):
         bag = bag_settings(config, topic, every_s=every_s, motion=motion)
-        guess = load_rig(rig) if rig else None
-        found = diagnose(dataset, guess, frames=frames, bag=bag, pictures=out)
+        guess = calibgraph.load_rig(rig) if rig else None
+        found = calibgraph.diagnose(dataset, guess, frames=frames, bag=bag, pictures=out)
     if out is not None:
         write_text(out / "doctor.json", json.dumps(found.to_mapping(), indent=1))
     if as_json:
@@ -127,8 +209,7 @@ def doctor(
             pairs += [("--topic", each) for each in topic or ()]
             words = [*dataset, *(word for pair in pairs for word in pair)]
             lines.append(f"no faults; next: calibgraph calibrate {join(map(str, words))}")
-        for line in lines:
-            print_line(line)
+        print_line(*lines)
     if not found.healthy:
         raise typer.Exit(1)
 
@@ -175,19 +256,18 @@ def export(
     """Write a calibration in the format of another program, with its direction as a comment."""
     import numpy as np
 
-    from calibgraph.io.formats.export import describe_changes, export_calibration, read_kit
-    from calibgraph.io.rigs import load_rig
+    from calibgraph.io.formats.export import describe_changes, read_kit
     from calibgraph.model.plausibility import MAX_DISTANCE_M, find_implausible
 
     with checked_arguments(), progress_bar("writing"):
         T_base_lidar = None if lidar_pose is None else _parse_pose(lidar_pose)
         before = {} if deployed is None else read_kit(deployed)
-        written = export_calibration(
+        written = calibgraph.export_calibration(
             source, out, format, cameras=camera or None, lidar_frame=lidar_frame,
             camera_frame=camera_frame, T_base_lidar=T_base_lidar, deployed=deployed,
             even_if_failed=even_if_failed, force=force,
         )  # fmt: skip
-        rig = load_rig(source)
+        rig = calibgraph.load_rig(source)
     rig = rig.model_copy(
         update={"cameras": {name: rig.cameras[name] for name in camera or rig.cameras}}
     )
@@ -195,8 +275,7 @@ def export(
         print_line(f"warning: --lidar-pose {lidar_pose!r}: lengths in millimetres?")
     lines = [f"warning: {line}" for line in find_implausible(rig)]
     lines += describe_changes(before, read_kit(out)) if before else []
-    for line in [*lines, *(f"{path}: written ({format})" for path in written)]:
-        print_line(line)
+    print_line(*lines, *(f"{path}: written ({format})" for path in written))
 
 
 def _parse_pose(text: str) -> NDArray[np.float64]:
@@ -240,18 +319,15 @@ def simulate(
     step_m: float = Option(4.0, help="Mean distance between frames."),
 ) -> None:
     """Simulate data with a known truth, reference.yaml, and a displaced guess, rig.yaml."""
-    from calibgraph.io.rigs import load_rig
-    from calibgraph.simulation.recording import simulate_street
     from calibgraph.simulation.rigs import RIG_NAMES, rig_of
 
     with progress_bar() as progress, checked_arguments():
         if scenario != STREET:
             raise ValueError(f"unknown scenario {scenario!r}; known is {STREET}")
         is_file = rig not in RIG_NAMES and rig and Path(rig).exists()
-        written = simulate_street(
-            out, load_rig(rig) if is_file else rig_of(rig), beams=beams, frames=frames,
+        written = calibgraph.simulate_street(
+            out, calibgraph.load_rig(rig) if is_file else rig_of(rig), beams=beams, frames=frames,
             step_m=step_m, seed=seed, rotation_deg=rotation_deg, translation_m=translation_m,
             progress=progress,
         )  # fmt: skip
-    for path in written:
-        print_line(f"{path}: written")
+    print_line(*(f"{path}: written" for path in written))

@@ -6,17 +6,14 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from typer import Argument, Option
 
+import calibgraph
 from calibgraph.cli.terminal import print_line, progress_bar
-
-if TYPE_CHECKING:
-    from calibgraph.io.bags import BagOptions
-    from calibgraph.io.dataset import Dataset
-    from calibgraph.matching.protocol import Matcher
-
+from calibgraph.errors import CalibrationError
+from calibgraph.stdout import require_stdout
 
 _SEARCH_LIMIT_S = 1800.0
 
@@ -24,8 +21,6 @@ _SEARCH_LIMIT_S = 1800.0
 @contextmanager
 def checked_arguments() -> Iterator[None]:
     """Turn the library's ``ValueError`` for a wrong argument into a one-line error."""
-    from calibgraph.errors import CalibrationError
-
     try:
         yield
     except ValueError as error:
@@ -36,45 +31,37 @@ def dataset_from(
     folders: list[Path],
     rig: Path | None,
     frames: str | None,
-    bag: BagOptions | None = None,
+    bag: calibgraph.BagOptions | None = None,
     *,
     interval_s: float | None = None,
-) -> Dataset:
+) -> calibgraph.Dataset:
     """The dataset in these folders; of bags, a line each is printed."""
-    from calibgraph.io.dataset import load_dataset
-    from calibgraph.io.rigs import load_rig
-
     with checked_arguments(), progress_bar("reading"):
-        known = load_rig(rig) if rig else None
-        data = load_dataset(folders, known, frames=frames, bag=bag, interval_s=interval_s)
-    for note in data.notes:
-        print_line(note)
+        known = calibgraph.load_rig(rig) if rig else None
+        data = calibgraph.load_dataset(
+            folders, known, frames=frames, bag=bag, interval_s=interval_s
+        )
+    print_line(*data.notes)
     return data
 
 
-def bag_options_from(topic: list[str] | None, **options: Any) -> BagOptions | None:
-    """How bags are read; None if no option is given.
+def bag_settings(
+    config: Path | None, topic: list[str] | None, **options: Any
+) -> calibgraph.BagOptions | None:
+    """How bags are read, by a file of settings and options; None if neither has anything of it.
 
     Raises:
         CalibrationError: if a value is out of range, or a topic has no name.
     """
-    from calibgraph.io.bags import BagOptions
-
-    given = {name: value for name, value in options.items() if value is not None}
-    if not topic and not given:
-        return None
-    with checked_arguments():
-        topics = parse_names("--topic", topic, "NAME=/TOPIC, as lidar=/velodyne_points")
-        return BagOptions(topics=topics, **given)
-
-
-def bag_settings(config: Path | None, topic: list[str] | None, **options: Any) -> BagOptions | None:
-    """See :func:`bag_options_from`; a file of settings has some of them."""
     from calibgraph.cli.settings import read_settings
 
     with checked_arguments():
-        _, rare = read_settings(config)
-    return bag_options_from(topic, **options, **rare.of_bags)
+        options |= read_settings(config)[1].of_bags
+        given = {name: value for name, value in options.items() if value is not None}
+        if not topic and not given:
+            return None
+        topics = parse_names("--topic", topic, "NAME=/TOPIC, as lidar=/velodyne_points")
+        return calibgraph.BagOptions(topics=topics, **given)
 
 
 def matcher_from(
@@ -85,7 +72,7 @@ def matcher_from(
     all_frames: bool = False,
     of_cmrnext: Mapping[str, Any] | None = None,
     **search: float | None,
-) -> Matcher:
+) -> calibgraph.Matcher:
     """The matcher of that name, or a table of correspondences.
 
     Args:
@@ -135,15 +122,6 @@ def parse_names(
 
 _BAGS, _STRUCTURE = "ROS bags", "Matcher structure"
 _MOST_SEED = 2**31 - 1
-
-
-def require_stdout(as_json: bool) -> bool:
-    """Refuse ``--json`` to a closed stdout before the work, not after it."""
-    if as_json:
-        from calibgraph.report.as_json import require_stdout
-
-        require_stdout()
-    return as_json
 
 
 Datasets = Annotated[

@@ -6,19 +6,17 @@ import re
 from dataclasses import replace
 from pathlib import Path
 from shlex import join
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from typer import Argument, Option
 
+import calibgraph
 from calibgraph.cli import options
-from calibgraph.cli.options import bag_options_from, checked_arguments, parse_names
-from calibgraph.cli.terminal import print_json, print_line, progress_bar
+from calibgraph.cli.options import bag_settings, checked_arguments, parse_names
+from calibgraph.cli.terminal import print_line, progress_bar
 from calibgraph.errors import CalibrationError
 from calibgraph.io.formats import IMPORT_FORMATS
-
-if TYPE_CHECKING:
-    from calibgraph.guessing.guess import RigGuess
-    from calibgraph.model.rig import Rig
+from calibgraph.stdout import print_json
 
 _TAKEN = {
     "a folder of images and clouds": {"mount", "lens"},
@@ -84,7 +82,6 @@ def rig(
     """
     from calibgraph.files import require_new_file
     from calibgraph.io.bags.storage import is_bag
-    from calibgraph.io.rigs import describe_rig
     from calibgraph.model.lens import state_calibrated
     from calibgraph.model.plausibility import find_implausible
     from calibgraph.trust.conventions import correct_guess
@@ -93,17 +90,20 @@ def rig(
         "mount": mount, "lens": lens, "topic": topic, "rename": rename, "lidar_frame": lidar_frame,
         "camera_frame": camera_frame, "size": size, "correct": correct, "json": as_json or None,
     }  # fmt: skip
-    path = Path(source[0])
-    if len(source) == 1 and not correct and _is_to_fill_in(path):
-        _refuse_others("a folder of images and clouds", given)
-        _write_template(path, out, mount, lens, forward=forward, replace=force)
+    kind = "bags alone" if not mount and all(map(is_bag, source)) else "files"
+    if len(source) == 1 and not correct and _is_to_fill_in(Path(source[0])):
+        kind = "a folder of images and clouds"
+    for name in (name for name, value in given.items() if value is not None):
+        if name not in _TAKEN[kind]:
+            kinds = " or ".join(each for each, names in _TAKEN.items() if name in names)
+            raise CalibrationError(f"--{name.replace('_', '-')} is for {kinds} only; leave it out")
+    if kind not in ("bags alone", "files"):
+        _write_template(Path(source[0]), out, mount, lens, forward=forward, replace=force)
         return
     if out is not None:
         require_new_file(out, ".yaml", ".yml", force=force)
-    is_of_bag = not mount and all(map(is_bag, source))
-    _refuse_others("bags alone" if is_of_bag else "files", given)
     with checked_arguments(), progress_bar("reading"):
-        if is_of_bag:
+        if kind == "bags alone":
             made, notes, topics = _rig_of_bags([*map(Path, source)], topic)
             guess = None
         else:
@@ -124,10 +124,9 @@ def rig(
         print_json(found | written | (guess.to_mapping() if guess else {}))
         return
     lines = [f"{each['topic']}  {each['type']}  {each['messages']}" for each in topics]
-    for line in [*lines, *(guess.lines if guess else describe_rig(made)), *notes]:
-        print_line(line)
+    lines += [*(guess.lines if guess else calibgraph.describe_rig(made)), *notes]
     end = f"{out}: written" if out is not None else "nothing was written; --out writes the rig"
-    print_line(f"{end}; check the sentences above against the vehicle")
+    print_line(*lines, f"{end}; check the sentences above against the vehicle")
 
 
 def _is_to_fill_in(path: Path) -> bool:
@@ -136,14 +135,6 @@ def _is_to_fill_in(path: Path) -> bool:
     from calibgraph.io.rigs import RIG_FILE, find_rig_file
 
     return path.is_dir() and not is_bag(path) and find_rig_file(path) in (None, path / RIG_FILE)
-
-
-def _refuse_others(kind: str, given: dict[str, Any]) -> None:
-    """Refuse options that would change nothing."""
-    for name, value in given.items():
-        if value is not None and name not in _TAKEN[kind]:
-            kinds = " or ".join(each for each, names in _TAKEN.items() if name in names)
-            raise CalibrationError(f"--{name.replace('_', '-')} is for {kinds} only; leave it out")
 
 
 def _parse_file(text: str) -> tuple[str, Path]:
@@ -163,12 +154,11 @@ def _size_px(size: str | None) -> tuple[int, int] | None:
 def _rig_of_files(
     source: list[str], mount: list[str] | None, *, forward: str, size_px: tuple[int, int] | None,
     **options: Any,
-) -> tuple[Rig, list[str], RigGuess | None]:  # fmt: skip
+) -> tuple[calibgraph.Rig, list[str], calibgraph.RigGuess | None]:  # fmt: skip
     """The rig, notes on it, and how good its guess is, where cameras are described.
 
     The other options are those of :func:`read_rig_parts`.
     """
-    from calibgraph.guessing.guess import guess_rig
     from calibgraph.io.formats.rig_import import read_rig_parts
 
     named, mountings = [_parse_file(text) for text in source], parse_names("--mount", mount)
@@ -178,19 +168,19 @@ def _rig_of_files(
     notes = [f"note: {note}" for note in parts.notes]
     if not mountings:
         return parts.to_rig(size_px=size_px), notes, None
-    guess = guess_rig(parts, mountings=mountings, forward=forward, size_px=size_px)
+    guess = calibgraph.guess_rig(parts, mountings=mountings, forward=forward, size_px=size_px)
     return guess.rig, notes, guess
 
 
 def _rig_of_bags(
     paths: list[Path], topic: list[str] | None
-) -> tuple[Rig, list[str], list[dict[str, Any]]]:
+) -> tuple[calibgraph.Rig, list[str], list[dict[str, Any]]]:
     """The rig of the first bag, notes on it, and its topics; the others serve where it lacks."""
     from calibgraph.io.bags.messages import Bag
     from calibgraph.io.bags.rig import doubtful_axes, read_bag_rig
 
     topics = sorted(Bag(paths[0]).topics.values(), key=lambda each: each.name)
-    read = read_bag_rig(paths[0], bag_options_from(topic, beside=tuple(paths[1:]) or None))
+    read = read_bag_rig(paths[0], bag_settings(None, topic, beside=tuple(paths[1:]) or None))
     made = read.to_rig()
     listed = [{"topic": each.name, "type": each.type, "messages": each.count} for each in topics]
     return made, [*doubtful_axes(made), *read.notes], listed
@@ -201,13 +191,13 @@ def _write_template(
 ) -> None:
     """Write the rig of a folder, with what is left to fill in, and say what comes next."""
     from calibgraph.guessing.mounting import CALIBRATION
-    from calibgraph.guessing.template import cameras_of_folder, write_rig_template
+    from calibgraph.guessing.template import cameras_of_folder
     from calibgraph.io.dataset_folders import describe_pairing
 
     with checked_arguments():
         words = parse_names("--mount", mount)
         known = _lenses(lens, [*cameras_of_folder(folder)])
-        path = write_rig_template(folder, out, mountings=words, lenses=known, **options)
+        path = calibgraph.write_rig_template(folder, out, mountings=words, lenses=known, **options)
         pairing = describe_pairing(folder)
     if pairing:
         print_line(pairing)

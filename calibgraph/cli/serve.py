@@ -15,10 +15,12 @@ from typing import TYPE_CHECKING
 import typer
 from typer import Argument, Option
 
+import calibgraph
 from calibgraph.cli import options
 from calibgraph.cli.options import JsonOption, bag_settings, dataset_from
-from calibgraph.cli.terminal import print_json, print_line, progress_bar
+from calibgraph.cli.terminal import print_line, progress_bar
 from calibgraph.errors import CalibrationError, FileError, needs_extra
+from calibgraph.stdout import print_json
 
 if TYPE_CHECKING:
     from calibgraph.fleet.page import FleetReport
@@ -183,10 +185,8 @@ def fleet(
     What is finished is not done again: after Ctrl-C, a crash or a lost machine the same command
     goes on. Exit 1 if a job failed or a camera's verdict is FAIL.
     """
-    from calibgraph.errors import CalibrationError
     from calibgraph.fleet.job import Limits
-    from calibgraph.fleet.page import write_fleet_report
-    from calibgraph.fleet.run import dask_executor, run_fleet, thread_executor
+    from calibgraph.fleet.run import dask_executor, thread_executor
 
     if dask is not None and jobs is not None:
         raise CalibrationError("--jobs is of this machine: with --dask the cluster's threads count")
@@ -194,8 +194,10 @@ def fleet(
     limits = Limits(timeout_s=timeout_s, memory_bytes=memory_bytes, fetch_bytes=fetch_gb * 1e9)
     opened = thread_executor(jobs) if dask is None else dask_executor(dask)
     with _interrupt_on_sigterm(), progress_bar() as progress, opened as executor:
-        summary = run_fleet(manifest, out, executor=executor, limits=limits, progress=progress)
-    report = write_fleet_report(out)
+        summary = calibgraph.run_fleet(
+            manifest, out, executor=executor, limits=limits, progress=progress
+        )
+    report = calibgraph.write_fleet_report(out)
     if as_json:
         print_json({"out": out, **asdict(summary), "moved_lidars": [*report.moved_lidars]})
     else:
@@ -227,5 +229,4 @@ def _print(summary: Summary, report: FleetReport, out: str) -> None:
     ]
     lines += [f"{vehicle}: all cameras moved alike: the LiDAR was moved"
               for vehicle in report.moved_lidars]  # fmt: skip
-    for line in [*lines, f"wrote {out}/fleet.html"]:
-        print_line(line)
+    print_line(*lines, f"wrote {out}/fleet.html")

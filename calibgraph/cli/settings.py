@@ -32,14 +32,13 @@ class RareSettings(StrictNumbers):
     @property
     def of_bags(self) -> dict[str, Any]:
         """Those of reading, by the names of :class:`calibgraph.io.bags.BagOptions`."""
-        return {"stamps": self.stamps, "sync_tolerance_s": self.sync_tolerance_s}
+        return self.model_dump(include={"stamps", "sync_tolerance_s"}, exclude_none=True)
 
     @property
     def of_cmrnext(self) -> dict[str, Any]:
         """Those of the matcher cmrnext that are given."""
-        names = ("device", "iterations", "half_resolution")
-        values = {name: getattr(self, name) for name in names}
-        return {name: value for name, value in values.items() if value is not None}
+        names = {"device", "iterations", "half_resolution"}
+        return self.model_dump(include=names, exclude_none=True)
 
 
 def read_settings(

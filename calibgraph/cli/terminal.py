@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -29,6 +28,7 @@ def terminal() -> Console:
     from rich.segment import Segment
 
     from calibgraph.errors import printable
+    from calibgraph.stdout import discard
 
     class Stderr(Console):
         def render(self, *arguments: Any, **options: Any) -> Iterable[Segment]:
@@ -38,26 +38,20 @@ def terminal() -> Console:
         def on_broken_pipe(self) -> None:
             """Go on without output: the files and the exit code are what counts."""
             self.quiet = True
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())
+            discard(sys.stderr)
 
     return Stderr(stderr=True)
 
 
-def print_line(text: str) -> None:
-    """Print a line on stderr as it is: no markup, no colours, no line breaks of rich's own."""
-    terminal().out(text, highlight=False)
+def print_line(*lines: str) -> None:
+    """Print lines on stderr as they are: no markup, no colours, no line breaks of rich's own."""
+    for text in lines:
+        terminal().out(text, highlight=False)
 
 
 def elapsed_s() -> float:
     """Seconds since the program started, by the clock on the wall."""
     return time.monotonic() - _STARTED
-
-
-def print_json(content: dict[str, Any]) -> None:
-    """Print one JSON document on stdout."""
-    from calibgraph.report import as_json
-
-    as_json.print_json(content)
 
 
 @contextmanager

@@ -117,22 +117,32 @@ def fingerprint(uri: str) -> str:
 
 
 def fetch(uri: str, folder: Path, most_bytes: float) -> Path:
-    """The local path of a URI; remote data of at most ``most_bytes`` are copied into a folder."""
+    """The local path of a URI; remote data of at most ``most_bytes`` are copied into a new folder.
+
+    Raises:
+        FileError: if nothing is there, or too much.
+        OSError: if it cannot be fetched: the next time it may work.
+    """
     filesystem, path = locate(uri)
     if is_local(filesystem):
         return Path(path)
-    if not filesystem.exists(path):
-        raise FileError(uri, "nothing is there; check the address")
-    size = sum(filesystem.du(path, total=False).values())
-    if size > most_bytes:
-        most = f"{most_bytes / 1e9:.3g} (--fetch-gb)"
-        raise FileError(uri, f"{size / 1e9:.3g} GB, expected up to {most}")
-    name = path.rstrip("/").rsplit("/", 1)[-1] or "recording"
-    target = folder / name
-    if filesystem.isdir(path):
-        filesystem.get(path.rstrip("/") + "/", f"{target}/", recursive=True)
-    else:
-        filesystem.get_file(path, str(target))
+    try:
+        if not filesystem.exists(path):
+            raise FileError(uri, "nothing is there; check the address")
+        size = sum(filesystem.du(path, total=False).values())
+        if size > most_bytes:
+            most = f"{most_bytes / 1e9:.3g} (--fetch-gb)"
+            raise FileError(uri, f"{size / 1e9:.3g} GB, expected up to {most}")
+        folder.mkdir(exist_ok=True)
+        target = folder / (path.rstrip("/").rsplit("/", 1)[-1] or "recording")
+        if filesystem.isdir(path):
+            filesystem.get(path.rstrip("/") + "/", f"{target}/", recursive=True)
+        else:
+            filesystem.get_file(path, str(target))
+    except CalibrationError:
+        raise
+    except Exception as error:  # of any store's client
+        raise OSError(f"{uri}: cannot be fetched ({error})") from error
     return target
 
 

@@ -18,10 +18,9 @@ from typing import Any
 from calibgraph.child_process import (
     ChildEndedError,
     ChildProcess,
-    ChildTimeoutError,
     Outcome,
     answer_requests,
-    describe_failure,
+    failed,
     memory_limit,
     output_to,
 )
@@ -29,7 +28,9 @@ from calibgraph.errors import CalibrationError
 from calibgraph.fleet.files import fetch
 from calibgraph.fleet.manifest import Job
 from calibgraph.model.calibration import version_of
+from calibgraph.report.as_json import verdict_summary
 
+RELEASE = version_of("calibgraph")
 _LOG, _MOST_LOG = "log.txt", 2**16
 _kept = threading.local()
 _children: list[ChildProcess] = []
@@ -50,20 +51,15 @@ class Limits:
     fetch_bytes: float = 50e9
 
 
-def release() -> str:
-    """The version of this package."""
-    return version_of("calibgraph")
-
-
 def run_job(job: Job, limits: Limits, of_release: str) -> Outcome:
     """Run a job in the child process of this thread.
 
     Raises:
         CalibrationError: if this machine has another version of the package than the command.
     """
-    if of_release != release():
+    if of_release != RELEASE:
         raise CalibrationError(
-            f"a worker has calibgraph {release()}, the command {of_release}; install the same "
+            f"a worker has calibgraph {RELEASE}, the command {of_release}; install the same "
             "version on all machines"
         )
     if getattr(_kept, "child", None) not in _children:
@@ -76,9 +72,8 @@ def run_job(job: Job, limits: Limits, of_release: str) -> Outcome:
             start = time.perf_counter()  # the libraries' loading is not the job's time
             outcome: Outcome = _kept.child.ask((job, limits, Path(folder)), limits.timeout_s)
         except ChildEndedError as error:
-            outcome = Outcome(error_kind="worker died", error=str(error))
-        except ChildTimeoutError as error:
-            outcome = Outcome(error_kind="timeout", error=f"{error}; see --timeout-s")
+            advice = "; see --timeout-s" if error.kind == "timeout" else ""
+            outcome = Outcome(error_kind=error.kind, error=f"{error}{advice}")
         seconds, log = time.perf_counter() - start, Path(folder) / _LOG
         text = log.read_bytes()[-_MOST_LOG:].decode(errors="replace") if log.exists() else ""
     return replace(outcome, seconds=seconds, log=text)
@@ -118,27 +113,17 @@ def main() -> None:
 def execute(job: Job, limits: Limits, folder: Path) -> Outcome:
     """Run a job here; what is wrong with its data or its machine is part of the outcome."""
     places = dict[str, str]()
+
+    def local(uri: str) -> Path:
+        """Noted for messages."""
+        path = fetch(uri, folder / str(len(places)), limits.fetch_bytes)
+        places[str(path)] = uri
+        return path
+
     try:
-        return Outcome(_calibrate(job, limits, lambda uri: _local(uri, limits, folder, places)))
+        return Outcome(_calibrate(job, limits, local))
     except Exception as error:
-        kind, text = describe_failure(error)
-    for place, uri in places.items():
-        text = text.replace(place, uri)
-    return Outcome(error_kind=kind, error=str(CalibrationError(text)))  # in one line
-
-
-def _local(uri: str, limits: Limits, folder: Path, places: dict[str, str]) -> Path:
-    """The local path of a URI, noted in ``places`` for messages."""
-    target = folder / str(len(places))
-    target.mkdir()
-    try:
-        path = fetch(uri, target, limits.fetch_bytes)
-    except CalibrationError:
-        raise
-    except Exception as error:  # of any store's client: the next time it may work
-        raise OSError(f"{uri}: cannot be fetched ({error})") from error
-    places[str(path)] = uri
-    return path
+        return failed(error, places)
 
 
 def _calibrate(
@@ -172,11 +157,9 @@ def _calibrate(
 def _cells(result: Any) -> tuple[dict[str, Any], ...]:
     rows = []
     for camera, verdict in result.camera_verdicts.items():
-        doubt, covariance = verdict.error_probability, result.covariance[camera]
-        summary = result.summary_of(camera)
+        covariance, summary = result.covariance[camera], result.summary_of(camera)
         rows.append({
-            "camera": camera, "verdict": verdict.status, "cannot_tell": verdict.cannot_tell,
-            "probability_off": None if doubt is None else doubt.probability,
+            "camera": camera, **verdict_summary(verdict),
             "reasons": [reason.text for reason in summary.reasons],
             "actions": [*summary.actions], "of": result.config.of,
             "T_camera_lidar": result.T_camera_lidar[camera].ravel().tolist(),

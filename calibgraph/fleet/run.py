@@ -16,7 +16,7 @@ import pyarrow as pa
 from calibgraph.child_process import Outcome
 from calibgraph.errors import CalibrationError, FileError, needs_extra
 from calibgraph.fleet.files import ROWS, SCHEMA, Store, read_rows
-from calibgraph.fleet.job import Limits, end_children, interrupt_jobs, release, run_job
+from calibgraph.fleet.job import RELEASE, Limits, end_children, interrupt_jobs, run_job
 from calibgraph.fleet.manifest import Job, Key, load_manifest
 from calibgraph.model.calibration import package_versions
 from calibgraph.parallel import count_cores
@@ -73,7 +73,7 @@ def run_fleet(
         todo = [job for job in jobs if not _is_finished(rows[job.key], hashes[job.key])]
         failed = 0
         with nullcontext(executor) if executor is not None else thread_executor() as opened:
-            running = {opened.submit(run_job, job, limits, release()): job for job in todo}
+            running = {opened.submit(run_job, job, limits, RELEASE): job for job in todo}
             for count, future in enumerate(as_completed([*running]), start=1):
                 job, outcome = running.pop(future), _outcome_of(future)
                 rows[job.key] = _rows_of(job, outcome, hashes[job.key])
@@ -165,9 +165,9 @@ def _known_rows(out: str, jobs: Sequence[Job]) -> dict[Key, list[dict[str, Any]]
         if (key := (row["vehicle"], row["recording"])) in own:
             found[key].append(row)
             version = json.loads(row["versions"]).get("calibgraph")
-            if version != release():
+            if version != RELEASE:
                 raise FileError(
-                    out, f"holds rows of calibgraph {version}, this is {release()}; choose another "
+                    out, f"holds rows of calibgraph {version}, this is {RELEASE}; choose another "
                     "--out"
                 )  # fmt: skip
     return found

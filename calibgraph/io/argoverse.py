@@ -1,10 +1,10 @@
 """Logs of the Argoverse 2 sensor data set: Feather tables, sweeps and images named by stamps.
 
-Its clouds are of two LiDARs, in the frame of the vehicle (egovehicle), corrected for motion; its
-images are undistorted.
+Its clouds are of two LiDARs, in the frame of the vehicle (egovehicle), corrected for motion;
+``LOG/up_lidar`` names the log with each LiDAR in its own frame. Its images are undistorted.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,20 +12,22 @@ import numpy as np
 
 from calibgraph.errors import DatasetError, FileError
 from calibgraph.files import checked_model
+from calibgraph.io.argoverse_lidars import (
+    POSES,
+    SWEEPS,
+    UP_AND_DOWN,
+    VEHICLE,
+    T_egovehicle_sensor,
+    row,
+)
 from calibgraph.io.frame import Frame
 from calibgraph.io.frame_files import files_by_stem
 from calibgraph.io.images import IMAGE_SUFFIXES
-from calibgraph.io.published import IncompleteCamera, PublishedFolder
-from calibgraph.io.rig_parts import pose_of_quaternion
-from calibgraph.io.tables import read_feather
+from calibgraph.io.published import PublishedFolder
 from calibgraph.model.geometry import invert
 from calibgraph.model.rig import Camera
 
-_LIDAR, _CAMERAS = Path("sensors/lidar"), Path("sensors/cameras")
-_POSES, _LENSES = (
-    Path("calibration/egovehicle_SE3_sensor.feather"), Path("calibration/intrinsics.feather"),
-)  # fmt: skip
-_QUATERNION, _PLACE = ("qx", "qy", "qz", "qw"), ("tx_m", "ty_m", "tz_m")
+_CAMERAS, _LENSES = Path("sensors/cameras"), Path("calibration/intrinsics.feather")
 _LENS = ("fx_px", "fy_px", "cx_px", "cy_px")
 _SIZE = ("width_px", "height_px")
 _MOST_DIGITS = 18  # of a stamp, in 64 bits
@@ -33,47 +35,55 @@ _APART_NS = 30_000_000
 """Between a sweep and its image: half the period of the cameras around the vehicle, and some."""
 
 
-def argoverse(log: Path) -> PublishedFolder | None:
-    """A log; None if a folder is none."""
-    if not ((log / _POSES).is_file() and (log / _LIDAR).is_dir()):
+def argoverse(path: Path) -> PublishedFolder | None:
+    """A log, whose clouds are of both LiDARs; or one of these in it, which is the base of both.
+
+    None if a path is neither.
+    """
+    log, base = (path.parent, path.name) if path.name in UP_AND_DOWN else (path, VEHICLE)
+    if not ((log / POSES).is_file() and (log / SWEEPS).is_dir()):
         return None
 
     def cameras() -> Sequence[str]:
         return sorted(each.name for each in (log / _CAMERAS).glob("*/"))
 
     return PublishedFolder(
-        "egovehicle", cameras, lambda name: _camera(log, name), lambda names: _frames(log, names)
+        lambda: _lidars(log, base),
+        cameras,
+        lambda name: _camera(log, base, name),
+        lambda names: _frames(log, base, names),
     )
 
 
-def _camera(log: Path, name: str) -> Camera:
-    pose = _row(log / _POSES, name, (*_QUATERNION, *_PLACE))
-    lens = _row(log / _LENSES, name, (*_LENS, *_SIZE))
-    xyz_m, xyzw = ([pose[key] for key in keys] for keys in (_PLACE, _QUATERNION))
-    try:
-        T_egovehicle_camera = pose_of_quaternion(xyz_m, xyzw)
-    except ValueError as error:
-        raise FileError(log / _POSES, str(error)) from error
+def _lidars(log: Path, base: str) -> Mapping[str, Any]:
+    """What a rig has of LiDARs."""
+    T_base_egovehicle = invert(T_egovehicle_sensor(log, base))
+    lidars: dict[str, Any] = {base: {}} | {
+        name: {"T_base_lidar": T_base_egovehicle @ T_egovehicle_sensor(log, name)}
+        for name in _beside(base)
+    }
+    return {"lidar": base, "lidars": lidars if len(lidars) > 1 else None}
+
+
+def _beside(base: str) -> list[str]:
+    """The other LiDARs."""
+    return [name for name in UP_AND_DOWN if base not in (VEHICLE, name)]
+
+
+def _camera(log: Path, base: str, name: str) -> Camera:
+    T_egovehicle_camera = T_egovehicle_sensor(log, name)
+    lens = row(log / _LENSES, name, (*_LENS, *_SIZE))
     content = {
         **{column: lens[column] for column in _SIZE},
         "intrinsics_px": {column[:2]: lens[column] for column in _LENS},
-        "T_camera_lidar": invert(T_egovehicle_camera),
+        "T_camera_lidar": invert(T_egovehicle_camera) @ T_egovehicle_sensor(log, base),
     }
     return checked_model(Camera, content, f"{log / _LENSES}: {name}")
 
 
-def _row(path: Path, name: str, columns: Sequence[str]) -> dict[str, Any]:
-    column = read_feather(path)[1]
-    names, table = [*map(str, column("sensor_name"))], {key: column(key) for key in columns}
-    if name not in names:
-        found = ", ".join(names) or "none"
-        raise IncompleteCamera(path, f"has no row of {name!r}; found {found}")
-    return {key: values[names.index(name)].item() for key, values in table.items()}
-
-
-def _frames(log: Path, cameras: Sequence[str]) -> list[Frame]:
+def _frames(log: Path, base: str, cameras: Sequence[str]) -> list[Frame]:
     """The sweeps that have an image of every camera, in order of time."""
-    sweeps = _stamped(log / _LIDAR, (".feather",))
+    sweeps = _stamped(log / SWEEPS, (".feather",))
     stamps = np.array(list(sweeps))
     images = {name: _stamped(log / _CAMERAS / name, IMAGE_SUFFIXES) for name in cameras}
     nearest = {}
@@ -81,7 +91,13 @@ def _frames(log: Path, cameras: Sequence[str]) -> list[Frame]:
         others = np.array(list(found))
         nearest[name] = others[np.abs(np.subtract.outer(stamps, others)).argmin(axis=1)]
     frames = [
-        Frame(i, str(stamp), cloud, {n: images[n][int(nearest[n][i])] for n in cameras})
+        Frame(
+            i,
+            str(stamp),
+            cloud if base == VEHICLE else cloud.with_suffix(f".{base}"),
+            {n: images[n][int(nearest[n][i])] for n in cameras},
+            lidar_paths={n: cloud.with_suffix(f".{n}") for n in _beside(base)},
+        )
         for i, (stamp, cloud) in enumerate(sweeps.items())
         if all(abs(nearest[n][i] - stamp) <= _APART_NS for n in cameras)
     ]

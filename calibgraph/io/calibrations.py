@@ -9,7 +9,7 @@ from pydantic import AfterValidator, AliasPath, BaseModel, BeforeValidator, Fiel
 
 from calibgraph.arrays import Array
 from calibgraph.errors import FileError
-from calibgraph.files import checked_model, load_model, read_yaml, sha256
+from calibgraph.files import checked_model, read_yaml, sha256
 from calibgraph.io.tables import load_camera_matches, load_correspondences
 from calibgraph.model.calibration import Calibration, Residuals
 from calibgraph.model.config import FORMER_SETTINGS, Config, Reported, Terms
@@ -239,7 +239,7 @@ class StatedResult(BaseModel):
 
 def stated_result(path: Path) -> StatedResult | None:
     """What the file of a rig states if it is a result; None if it is none."""
-    return load_model(StatedResult, path) if is_calibration_file(path) else None
+    return checked_model(StatedResult, read_yaml(path), path) if is_calibration_file(path) else None
 
 
 def _require_whole(content: Mapping[str, Any], path: Path) -> None:

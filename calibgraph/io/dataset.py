@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import uuid
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, partial
 from pathlib import Path
 from shlex import quote
@@ -51,6 +51,8 @@ class Dataset:
         recorded: all frames of the folders, where only some of them were selected.
         notes: what was found in the first cloud, a bag or tables, and what was left out, a line
             each.
+        lidar_errors: per LiDAR but the base, (6, k) twist of it in the base by a standard deviation
+            of each of the errors of LiDARs; empty unless clouds are joined.
     """
 
     rig: Rig
@@ -58,6 +60,7 @@ class Dataset:
     folders: tuple[Path, ...]
     recorded: tuple[Frame, ...] = ()
     notes: tuple[str, ...] = ()
+    lidar_errors: Mapping[str, Array] = field(default_factory=dict)
 
     def neighbour(self, frame: Frame, later: int) -> Frame | None:
         """The frame recorded ``later`` frames later in the same folder, selected or not."""

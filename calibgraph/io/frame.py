@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError, DatasetError
 from calibgraph.files import sha256
+from calibgraph.io.argoverse_lidars import file_of
 from calibgraph.io.bags import (
     MESSAGE_SUFFIX,
     hash_message,
@@ -441,4 +442,4 @@ def frame_of_entry(entry: Mapping[str, Any]) -> Frame:
 
 def hash_source(path: Path) -> str:
     """SHA-256 of a file, or of a message in a bag."""
-    return hash_message(path) if path.suffix == MESSAGE_SUFFIX else sha256(path)
+    return hash_message(path) if path.suffix == MESSAGE_SUFFIX else sha256(file_of(path))

@@ -24,7 +24,8 @@ from calibgraph.io.frame import Frame, frames_by_stem
 from calibgraph.io.frame_files import files_by_stem
 from calibgraph.io.images import IMAGE_SUFFIXES, image_size
 from calibgraph.io.lenses import intrinsics_of_matrix
-from calibgraph.io.published import IncompleteCamera, PublishedFolder
+from calibgraph.io.published import PublishedFolder
+from calibgraph.io.rig_parts import IncompleteCamera
 from calibgraph.model.geometry import transform
 from calibgraph.model.rig import Camera
 
@@ -86,7 +87,7 @@ def _folder(
         return frames_by_stem(files_by_stem(clouds, (".bin",)), of)
 
     name = _RAW_CLOUDS if clouds.name == "data" else CLOUD_FOLDER
-    return PublishedFolder(name, cameras, read, frames)
+    return PublishedFolder(lambda: {"lidar": name}, cameras, read, frames)
 
 
 def _of_date(drive: Path, name: str) -> "NumberLines":

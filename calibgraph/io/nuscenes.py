@@ -18,8 +18,8 @@ from calibgraph.errors import DatasetError, FileError
 from calibgraph.files import checked_model, read_text
 from calibgraph.io.frame import Frame
 from calibgraph.io.lenses import intrinsics_of_matrix
-from calibgraph.io.published import IncompleteCamera, PublishedFolder
-from calibgraph.io.rig_parts import pose_of_quaternion
+from calibgraph.io.published import PublishedFolder
+from calibgraph.io.rig_parts import IncompleteCamera, pose_of_quaternion
 from calibgraph.model.geometry import invert
 from calibgraph.model.rig import Camera, Finite
 
@@ -78,7 +78,9 @@ def nuscenes(path: Path) -> PublishedFolder | None:
             for n, taken in enumerate(instants)
         ]
 
-    return PublishedFolder(LIDAR, cameras, lambda name: _camera(path, name), frames)
+    return PublishedFolder(
+        lambda: {"lidar": LIDAR}, cameras, lambda name: _camera(path, name), frames
+    )
 
 
 def _camera(path: Path, name: str) -> Camera:

@@ -1,30 +1,26 @@
 """What readers of published data sets return: frames, and the rig of the complete cameras."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from calibgraph.errors import FileError
 from calibgraph.files import checked_model
 from calibgraph.io.frame import Frame
+from calibgraph.io.rig_parts import IncompleteCamera
 from calibgraph.model.rig import Camera, Rig
-
-
-class IncompleteCamera(FileError):
-    """A camera without its lens, its pose or its images; what is there but wrong is no such."""
 
 
 class PublishedFolder(NamedTuple):
     """A folder of a published data set, read as far as it is asked.
 
     Attributes:
-        lidar: its name.
+        content: what its rig has besides cameras.
         cameras: their names.
         read: the lens and T_camera_lidar of one; IncompleteCamera if a part is missing.
         frames: the clouds in order, with the images of the cameras that have one.
     """
 
-    lidar: str
+    content: Callable[[], Mapping[str, Any]]
     cameras: Callable[[], Sequence[str]]
     read: Callable[[str], Camera]
     frames: Callable[[Sequence[str]], list[Frame]]
@@ -41,4 +37,4 @@ class PublishedFolder(NamedTuple):
         if missing and not cameras:
             raise next(iter(missing.values()))
         notes = tuple(f"{error}: camera {name!r} is left out" for name, error in missing.items())
-        return checked_model(Rig, {"lidar": self.lidar, "cameras": cameras}, path), notes
+        return checked_model(Rig, {**self.content(), "cameras": cameras}, path), notes

@@ -15,13 +15,17 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calibgraph.arrays import Array
-from calibgraph.errors import DatasetError, RigError
+from calibgraph.errors import DatasetError, FileError, RigError
 from calibgraph.files import checked_model
 from calibgraph.io.lenses import CameraLens
 from calibgraph.model.geometry import invert, transform
 from calibgraph.model.rig import ROUNDING, Mount, RelativePose, Rig
 
 _TURN_RAD = 2 * math.pi + ROUNDING
+
+
+class IncompleteCamera(FileError):
+    """A camera without its lens, its pose or its images; what is there but wrong is no such."""
 
 
 def quaternion_xyzw(T: Array) -> list[float]:

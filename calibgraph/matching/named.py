@@ -41,7 +41,8 @@ def is_table(matcher: Matcher | Correspondences | Path | str) -> bool:
     """Whether it is a table, whose points stay where they are, whatever clouds are given."""
     if isinstance(matcher, (str, Path)):
         return Path(matcher).suffix in (".parquet", ".csv")
-    return isinstance(matcher, Correspondences)
+    inner = matcher.inner if isinstance(matcher, FullMatcher) else matcher
+    return isinstance(inner, (Correspondences, TableMatcher))
 
 
 def find_matcher(matcher: Matcher | Correspondences | Path | str, *, seed: int = 0) -> FullMatcher:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from calibgraph.io.dataset import Dataset
+from calibgraph.matching.joined_clouds import with_lidar_errors
 from calibgraph.model.config import LensPart, Stage1Source
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.findings import STAGE1, MatcherFindings
@@ -68,6 +69,7 @@ class FullMatcher:
     """A matcher with every member: the only place of the defaults.
 
     Attributes:
+        inner: the matcher itself.
         rounds, stage1: as of :class:`Matcher`.
         most_frames: most frames of a dataset to use, chosen of more; None for all.
         knows_motion: whether its tables have the motion of the LiDAR, ``twist_per_s``.
@@ -86,7 +88,7 @@ class FullMatcher:
     def __init__(self, matcher: Matcher) -> None:
         if matcher.rounds < 1:
             raise ValueError(f"the matcher has {matcher.rounds} rounds, expected at least 1")
-        self._matcher = matcher
+        self.inner = matcher
         self.rounds = matcher.rounds
         self.stage1: Stage1Source = matcher.stage1
         self.most_frames: int | None = getattr(matcher, "most_frames", None)
@@ -100,15 +102,15 @@ class FullMatcher:
         One that is not itself matches also after ``release`` of the other: it checks the time of
         the images, if it has ``tracking_rounds``.
         """
-        make = getattr(self._matcher, "with_estimate", None)
-        made = self._matcher if make is None else make(parts)
-        return self if made is self._matcher else FullMatcher(made)
+        make = getattr(self.inner, "with_estimate", None)
+        made = self.inner if make is None else make(parts)
+        return self if made is self.inner else FullMatcher(made)
 
     def locate(
         self, dataset: Dataset, rig: Rig, *, out_of_time: Callable[[], bool], progress: Progress
     ) -> Start:
         """Find where the rounds begin; by default, at the initial guess."""
-        locate = getattr(self._matcher, "locate", None)
+        locate = getattr(self.inner, "locate", None)
         if locate is None:
             return Start(rig)
         start: Start = locate(dataset, rig, out_of_time=out_of_time, progress=progress)
@@ -117,10 +119,14 @@ class FullMatcher:
     def match(
         self, dataset: Dataset, rig: Rig, *, round_index: int, progress: Progress
     ) -> Correspondences:
-        """The matcher's own correspondences; its source of Stage 1 in their metadata."""
-        table = self._matcher.match(dataset, rig, round_index=round_index, progress=progress)
-        return table.with_metadata({STAGE1: self.stage1, **table.metadata})
+        """The matcher's own correspondences; its source of Stage 1 in their metadata.
+
+        With joined clouds they state what errors of LiDARs add, too.
+        """
+        table = self.inner.match(dataset, rig, round_index=round_index, progress=progress)
+        table = table.with_metadata({STAGE1: self.stage1, **table.metadata})
+        return with_lidar_errors(table, dataset, rig)
 
     def release(self) -> None:
         """No more rounds follow: release memory that is kept between them; nothing by default."""
-        getattr(self._matcher, "release", lambda: None)()
+        getattr(self.inner, "release", lambda: None)()

@@ -6,12 +6,12 @@ Tangent vectors are (rotation [rad], translation [m]).
 """
 
 import math
-from collections.abc import Container, Mapping
+from collections.abc import Container, Mapping, Sequence
 from itertools import combinations
 
 import gtsam
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from calibgraph.arrays import Array
@@ -146,6 +146,12 @@ def twists_between(T_a_b: Array, references: Array) -> Array:
 def pose_rows(camera: int) -> slice:
     """The six rows of camera number ``camera`` in a joint vector or matrix of all cameras."""
     return slice(6 * camera, 6 * camera + 6)
+
+
+def rows_of_poses(names: Sequence[str], order: Sequence[str]) -> NDArray[np.int64]:
+    """(6 n,) rows of named poses in a covariance of poses in an order."""
+    rows = [np.r_[pose_rows(order.index(name))] for name in names]
+    return np.array(rows, np.int64).ravel()
 
 
 def relative_covariance(joint: Array, a: int, b: int, T_b_a: Array) -> Array:

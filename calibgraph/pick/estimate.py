@@ -20,7 +20,7 @@ from calibgraph.errors import CalibrationError, FileError
 from calibgraph.files import StrictNumbers, checked_model, read_json, write_text
 from calibgraph.model.config import Config
 from calibgraph.model.correspondences import Correspondences
-from calibgraph.model.geometry import transform
+from calibgraph.model.geometry import move_points, transform
 from calibgraph.model.rig import Camera, Rig
 from calibgraph.pipeline import solve
 from calibgraph.solver.pnp import view_plane
@@ -70,33 +70,37 @@ def estimate_from_pairs(rig: Rig, pairs: Sequence[Pair]) -> Estimate:
         rig: lenses, the guess, and measured relative poses.
         pairs: all of them.
     """
-    of = {name: [pair for pair in pairs if pair.camera == name] for name in rig.cameras}
-    of = {name: some for name, some in of.items() if some}
-    problems = {name: _problem(some) for name, some in of.items()}
-    found = {name: _pnp(rig.cameras[name], of[name]) for name in of if not problems[name]}
+    if not pairs:
+        return None, {}
+    table = to_table(pairs)
+    of = {name: table.of_camera(name) for name in rig.cameras if name in table.cameras}
+    problems = {name: _problem(rows.points_lidar_m) for name, rows in of.items()}
+    found = {name: None if problems[name] else _pnp(rig.cameras[name], of[name]) for name in of}
     starts = {name: T for name, T in found.items() if T is not None}
-    solved = _solve(rig, starts, [pair for name in starts for pair in of[name]]) if starts else None
+    solved = _solve(rig, starts, table) if starts else None
     cameras = {}
-    for name, some in of.items():
-        camera = (solved or rig).cameras[name] if name in starts else rig.cameras[name]
-        cameras[name] = CameraEstimate(
-            residuals_px=_residuals(camera, camera.T_camera_lidar, some),
-            left_out_px=_left_out(camera, some) if name in starts else np.full(len(some), np.nan),
-            problem="" if name in starts else problems[name] or "PnP finds no pose",
-        )
+    for name, rows in of.items():
+        camera, left_out = rig.cameras[name], np.full(len(rows), np.nan)
+        if solved is not None and name in starts:
+            camera, left_out = solved.cameras[name], _left_out(camera, rows)
+        elif not problems[name]:
+            problems[name] = "PnP finds no pose"
+        residuals = _residuals(camera, camera.T_camera_lidar, rows)
+        cameras[name] = CameraEstimate(residuals, left_out, problems[name])
     return solved, cameras
 
 
-def _solve(rig: Rig, starts: dict[str, Array], pairs: Sequence[Pair]) -> Rig:
+def _solve(rig: Rig, starts: dict[str, Array], table: Correspondences) -> Rig:
     """The rig of these cameras, each with its covariance."""
     ties = tuple(tie for tie in rig.relative_poses if {tie.a, tie.b} <= starts.keys())
     part = rig.model_copy(
         update={"cameras": {n: rig.cameras[n] for n in starts}, "relative_poses": ties}
     )
-    found = solve(part.moved_to(starts), to_table(pairs), SOLVE, terms="reprojection")
+    table = table.without_cameras({*table.cameras} - starts.keys())
+    found = solve(part.moved_to(starts), table, SOLVE, terms="reprojection")
     cameras = {}
     for name, camera in found.rig.cameras.items():
-        covariance, freedom = found.covariance[name], 2 * sum(p.camera == name for p in pairs) - 6
+        covariance, freedom = found.covariance[name], 2 * len(table.of_camera(name)) - 6
         if covariance is not None:  # the scatter of few pairs is uncertain itself: Student's law
             covariance = covariance * freedom / (freedom - 2)
         cameras[name] = camera.model_copy(update={"covariance": covariance})
@@ -119,16 +123,15 @@ def reference_rig(estimate: Estimate) -> Rig:
     return rig
 
 
-def _pnp(camera: Camera, pairs: Sequence[Pair]) -> Array | None:
+def _pnp(camera: Camera, pairs: Correspondences) -> Array | None:
     """T_camera_lidar; None if there is none."""
-    pixels, points = _arrays(pairs)
-    turn, plane = view_plane(camera, pixels)
+    turn, plane = view_plane(camera, pairs.pixels_px)
     usable = np.isfinite(plane[:, 0])
     if np.count_nonzero(usable) < MIN_PAIRS - 1:
         return None
     try:
         found, turned, shift = cv2.solvePnP(
-            points[usable], plane[usable], np.eye(3), None, flags=cv2.SOLVEPNP_SQPNP
+            pairs.points_lidar_m[usable], plane[usable], np.eye(3), None, flags=cv2.SOLVEPNP_SQPNP
         )
     except cv2.error:  # a degenerate layout
         return None
@@ -136,39 +139,32 @@ def _pnp(camera: Camera, pairs: Sequence[Pair]) -> Array | None:
     return T if found and np.isfinite(T).all() else None
 
 
-def _left_out(camera: Camera, pairs: Sequence[Pair]) -> Array:
+def _left_out(camera: Camera, pairs: Correspondences) -> Array:
     """(n,) distance [px] of each pair from the pose that all others give; NaN of too few."""
     distances = np.full(len(pairs), np.nan)
-    for i, pair in enumerate(pairs if len(pairs) > MIN_PAIRS else ()):
-        others = [*pairs[:i], *pairs[i + 1 :]]
-        T = _pnp(camera, others)
+    for one in np.eye(len(pairs), dtype=bool) if len(pairs) > MIN_PAIRS else ():
+        T = _pnp(camera, pairs.select(~one))
         if T is not None:
-            distances[i] = np.linalg.norm(_residuals(camera, T, [pair]))
+            distances[one] = np.linalg.norm(_residuals(camera, T, pairs.select(one)))
     return distances
 
 
-def _residuals(camera: Camera, T: Array, pairs: Sequence[Pair]) -> Array:
+def _residuals(camera: Camera, T: Array, pairs: Correspondences) -> Array:
     """(n, 2) projected minus picked; infinite of points that the lens does not see."""
-    pixels, points = _arrays(pairs)
-    projected, valid = camera.lens.project(points @ T[:3, :3].T + T[:3, 3])
-    return np.where(valid[:, None], projected - pixels, np.inf)
+    projected, valid = camera.lens.project(move_points(pairs.points_lidar_m, T))
+    return np.where(valid[:, None], projected - pairs.pixels_px, np.inf)
 
 
-def _arrays(pairs: Sequence[Pair]) -> tuple[Array, Array]:
-    return np.array([p.pixel_px for p in pairs]), np.array([p.point_lidar_m for p in pairs])
-
-
-def _problem(pairs: Sequence[Pair]) -> str:
+def _problem(points_m: Array) -> str:
     """Why pairs determine no pose; empty if they may."""
-    points = _arrays(pairs)[1]
-    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False) / np.sqrt(len(points))
-    if len(pairs) < MIN_PAIRS:
-        return f"{len(pairs)} of {MIN_PAIRS} pairs"
+    centred = points_m - points_m.mean(axis=0)
+    spread = np.linalg.svd(centred, compute_uv=False) / np.sqrt(len(points_m))
+    if len(points_m) < MIN_PAIRS:
+        return f"{len(points_m)} of {MIN_PAIRS} pairs"
     return "its points lie on one line" if np.hypot(*spread[1:]) < _LINE_M else ""
 
 
 SESSION_FILE = "session.json"
-SESSION_FORMAT: Literal["calibgraph-pick/2"] = "calibgraph-pick/2"
 _Number = Annotated[float, Field(ge=-1e6, le=1e6)]
 
 
@@ -197,7 +193,7 @@ class Session(StrictNumbers):
         pairs: in the order in which they were picked.
     """
 
-    format: Literal["calibgraph-pick/2"] = SESSION_FORMAT
+    format: Literal["calibgraph-pick/2"] = "calibgraph-pick/2"
     frames: tuple[str, ...]
     cameras: tuple[str, ...]
     pairs: Annotated[tuple[Pair, ...], Field(max_length=2000)] = ()
@@ -225,7 +221,7 @@ def open_session(path: Path, frames: Sequence[str], cameras: Sequence[str]) -> S
     return session
 
 
-def to_table(pairs: Sequence[Pair], **further: str) -> Correspondences:
+def to_table(pairs: Sequence[Pair]) -> Correspondences:
     """The pairs as a table of correspondences; their frames share no error of a matcher."""
     return Correspondences.from_arrays(
         camera=np.array([pair.camera for pair in pairs], dtype=np.str_),
@@ -233,7 +229,6 @@ def to_table(pairs: Sequence[Pair], **further: str) -> Correspondences:
         pixels_px=np.array([pair.pixel_px for pair in pairs]),
         points_lidar_m=np.array([pair.point_lidar_m for pair in pairs]),
         metadata={
-            "matcher": "pick", "systematic_rotation_rad": 0.0, "systematic_translation_m": 0.0,
-            **further,
+            "matcher": "pick", "systematic_rotation_rad": 0.0, "systematic_translation_m": 0.0
         },
     )  # fmt: skip

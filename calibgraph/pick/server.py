@@ -26,7 +26,7 @@ from calibgraph.io.dataset import Dataset
 from calibgraph.io.frame import Frame
 from calibgraph.io.rigs import REFERENCE_FILE
 from calibgraph.matching.structure.visibility import find_in_view, find_visible
-from calibgraph.model.geometry import degrees_and_centimetres
+from calibgraph.model.geometry import degrees_and_centimetres, move_points
 from calibgraph.model.rig import Camera
 from calibgraph.pick.estimate import (
     SESSION_FILE,
@@ -135,8 +135,8 @@ def visible_points(points_lidar_m: Array, camera: Camera) -> NDArray[np.float32]
     area = float(np.prod(np.maximum(np.ptp(angles, axis=0), 1e-6))) if len(rows) > 1 else 1.0
     cell_rad = _HIDDEN_SPACINGS * float(np.sqrt(area / max(len(rows), 1)))
     seen = find_visible(angles, distance_m, cell_rad)
-    T = camera.T_camera_lidar
-    pixels, _ = camera.lens.project(points_lidar_m[rows[seen]] @ T[:3, :3].T + T[:3, 3])
+    shown = move_points(points_lidar_m[rows[seen]], camera.T_camera_lidar)
+    pixels, _ = camera.lens.project(shown)
     return np.column_stack([pixels, distance_m[seen]]).astype(np.float32)
 
 
@@ -195,14 +195,7 @@ class _Handler(BaseHTTPRequestHandler):
     timeout = 60.0
 
     def do_GET(self) -> None:
-        """The page, or data of the session."""
-        self._answer(self._get)
-
-    def do_POST(self) -> None:
-        """Change the session, or write what it gives."""
-        self._answer(self._post)
-
-    def _answer(self, respond: object) -> None:
+        """The page, data of the session, or a change of it."""
         parts = self.path.split("?")[0].split("/")
         host, origin = f"127.0.0.1:{self.server.server_port}", self.headers.get("Origin")
         if self.headers.get("Host") != host or origin not in (None, f"http://{host}"):
@@ -210,41 +203,40 @@ class _Handler(BaseHTTPRequestHandler):
         if len(parts) < 3 or not secrets.compare_digest(parts[1], self.server.key):  # noqa: PLR2004
             return self._send(404, b"no such page", "text/plain")
         try:
-            assert callable(respond)
-            return self._send(200, *respond([unquote(part) for part in parts[2:]]))
+            return self._send(200, *self._answer([unquote(part) for part in parts[2:]]))
         except (CalibrationError, ValidationError, ValueError, LookupError) as error:
-            line = str(error).partition("\n")[0]
-            return self._send(400, json.dumps({"error": line}).encode(), "application/json")
+            status, line = 400, str(error).partition("\n")[0]
         except OSError as error:
-            return self._send(500, json.dumps({"error": str(error)}).encode(), "application/json")
+            status, line = 500, str(error)
+        return self._send(status, *_json({"error": line}))
 
-    def _get(self, parts: list[str]) -> tuple[bytes, str]:
-        workspace = self.server.workspace
-        match parts:
-            case ["session"]:
-                return _json(workspace.state())
-            case ["cloud", frame]:
-                return workspace.cloud(int(frame)).tobytes(), "application/octet-stream"
-            case ["image", frame, camera]:
-                return workspace.image(int(frame), camera), "image/jpeg"
-            case ["projected", frame, camera]:
-                points = workspace.projected(int(frame), camera)
-                return points.tobytes(), "application/octet-stream"
-            case [name] if name in _PAGE:
-                file, kind = _PAGE[name]
-                return files("calibgraph.pick").joinpath("page", file).read_bytes(), kind
-        raise LookupError("no such page")
+    do_POST = do_GET
 
-    def _post(self, parts: list[str]) -> tuple[bytes, str]:
-        length = int(self.headers.get("Content-Length", "0"))
+    def _answer(self, parts: list[str]) -> tuple[bytes, str]:
+        workspace, length = self.server.workspace, int(self.headers.get("Content-Length", "0"))
         if not 0 <= length <= MAX_BODY_BYTES:
             raise ValueError(f"a body of at most {MAX_BODY_BYTES} bytes is expected")
         body = self.rfile.read(length)
-        if parts == ["pairs"]:
-            return _json(self.server.workspace.change(_PAIRS.validate_json(body)))
-        if parts == ["write"]:
-            return _json({"files": [str(path) for path in self.server.workspace.write()]})
-        raise LookupError("no such page")
+        match self.command, *parts:
+            case "GET", "session":
+                content = workspace.state()
+            case "POST", "pairs":
+                content = workspace.change(_PAIRS.validate_json(body))
+            case "POST", "write":
+                content = {"files": [str(path) for path in workspace.write()]}
+            case "GET", "cloud", frame:
+                return workspace.cloud(int(frame)).tobytes(), "application/octet-stream"
+            case "GET", "projected", frame, camera:
+                points = workspace.projected(int(frame), camera)
+                return points.tobytes(), "application/octet-stream"
+            case "GET", "image", frame, camera:
+                return workspace.image(int(frame), camera), "image/jpeg"
+            case "GET", name if name in _PAGE:
+                file, kind = _PAGE[name]
+                return files("calibgraph.pick").joinpath("page", file).read_bytes(), kind
+            case _:
+                raise LookupError("no such page")
+        return _json(content)
 
     def _send(self, status: int, body: bytes, kind: str) -> None:
         self.send_response(status)

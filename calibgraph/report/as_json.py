@@ -1,15 +1,9 @@
-"""Results as JSON on stdout, for programs: ``--json``."""
+"""Results as plain values, for programs: ``--json``."""
 
-import json
-import math
-import os
-import sys
-from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from calibgraph.errors import FileError
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.verdict import Verdict
 
@@ -20,7 +14,7 @@ def result_summary(result: Calibration, written: list[Path]) -> dict[str, Any]:
     for name, T in result.T_camera_lidar.items():
         cameras[name] = {
             "T_camera_lidar": T.tolist(),
-            **_of_verdict(result.camera_verdicts[name]),
+            **verdict_summary(result.camera_verdicts[name]),
             "actions": list(result.summary_of(name).actions),
             **_sigmas(result, name),
             "residuals": _values(result.residuals.get(name)),
@@ -38,13 +32,13 @@ def result_summary(result: Calibration, written: list[Path]) -> dict[str, Any]:
     lidars = {
         name: {
             "T_base_lidar": result.T_base_lidar[name].tolist(),
-            **_of_verdict(verdict),
+            **verdict_summary(verdict),
             **_sigmas(result, name),
         }
         for name, verdict in result.lidar_verdicts.items()
     }
     return {
-        **_of_verdict(result.verdict),
+        **verdict_summary(result.verdict),
         "summary": asdict(result.summary),
         "warnings": list(result.warnings),
         "places": [list(place) for place in result.places],
@@ -56,7 +50,8 @@ def result_summary(result: Calibration, written: list[Path]) -> dict[str, Any]:
     }
 
 
-def _of_verdict(verdict: Verdict) -> dict[str, Any]:
+def verdict_summary(verdict: Verdict) -> dict[str, Any]:
+    """A verdict as plain values."""
     doubt = verdict.error_probability
     return {
         "verdict": verdict.status,
@@ -78,47 +73,3 @@ def _sigmas(result: Calibration, name: str) -> dict[str, list[float] | bool | No
         "rotation_sigma_deg": None if sigmas is None else sigmas[0].tolist(),
         "translation_sigma_cm": None if sigmas is None else sigmas[1].tolist(),
     }
-
-
-def print_json(content: dict[str, Any]) -> None:
-    """Print one JSON document on stdout; a reader that has gone is no error."""
-    with suppress(BrokenPipeError):
-        print_line(json.dumps(finite(content), indent=2, allow_nan=False))
-
-
-def print_line(text: str) -> None:
-    """Print a line on stdout at once.
-
-    Raises:
-        BrokenPipeError: if the reader has closed the pipe.
-        FileError: if it cannot be written.
-    """
-    try:
-        sys.stdout.write(text + "\n")
-        sys.stdout.flush()
-    except OSError as error:
-        discard_stdout()
-        if isinstance(error, BrokenPipeError):
-            raise
-        what = f"cannot be written to ({error.strerror}); restart"
-        raise FileError("standard output", what) from error
-
-
-def require_stdout() -> None:
-    """Check, before hours of work, that there is a standard output."""
-    if sys.stdout is None:
-        raise FileError("standard output", "is closed; give what is printed somewhere to go")
-
-
-def discard_stdout() -> None:
-    """Discard what else is written: Python would write it at its exit, and report the error."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
-def finite(value: Any) -> Any:
-    """Replace NaN and infinity, which JSON does not have, by None, inside dicts and lists too."""
-    if isinstance(value, dict):
-        return {key: finite(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -11,11 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from calibgraph.arrays import Array
 from calibgraph.files import write_text, written_together
-from calibgraph.io.dataset import Dataset
 from calibgraph.io.formats import EXPORT_FORMATS
-from calibgraph.io.frame import frame_of_entry
+from calibgraph.io.frame import Frame, frame_of_entry
 from calibgraph.model.calibration import FRAMES_SENTENCE, TANGENT_SENTENCE, Calibration
-from calibgraph.model.geometry import degrees_and_centimetres, invert
+from calibgraph.model.geometry import invert
 from calibgraph.model.metrics import pose_error
 from calibgraph.model.places import describe_places
 from calibgraph.model.result_files import (
@@ -26,16 +25,18 @@ from calibgraph.model.result_files import (
     TABLES,
     require_own_tables,
 )
+from calibgraph.model.rig import Camera
 from calibgraph.model.verdict import Check, beside, in_unit, is_reachable
 from calibgraph.report.kit import page_template
-from calibgraph.report.lidar_views import draw_lidars
-from calibgraph.report.page_overlays import (
+from calibgraph.report.pictures import (
     depth_scale,
+    draw_lidars,
     draw_overlays,
     width_on_page,
     write_overlays,
 )
 from calibgraph.report.plots import reprojection_errors, residual_map
+from calibgraph.report.tables import moved_cells
 
 
 def write_report(result: Calibration, path: Path | str) -> Path:
@@ -56,14 +57,16 @@ def write_report(result: Calibration, path: Path | str) -> Path:
 
 def render_page(result: Calibration) -> str:
     """The page as text, its diagrams drawn into it."""
-    errors, rig, guess = reprojection_errors(result), result.rig, result.initial_rig
+    rig, guess = result.rig, result.initial_rig
+    maps = {
+        name: residual_map(rig.cameras[name], errors, result.residuals[name].gate_px)
+        for name, errors in reprojection_errors(result).items()
+    }
     overlays, overlays_left_out = dict[str, tuple[str, ...]](), None
-    shown = frame_of_entry(result.frames[len(result.frames) // 2]) if result.frames else None
-    if shown is None:
+    if (shown := _shown_frame(result)) is None:
         overlays_left_out = "the result was made from a table, which names no images"
     elif rig.cameras:
-        pairs = {name: (guess.cameras[name], camera) for name, camera in rig.cameras.items()}
-        overlays, overlays_left_out = draw_overlays(shown, pairs)
+        overlays, overlays_left_out = draw_overlays(shown, _before_and_after(result))
     cameras = [
         {
             "name": name,
@@ -72,12 +75,21 @@ def render_page(result: Calibration) -> str:
             "moved": pose_error(camera.T_camera_lidar, guess.T_camera_lidar[name]),
             "sigmas": result.error_bar(name),
             "overlays": overlays.get(name),
-            "residuals": residual_map(camera, errors[name]) if name in errors else None,
+            "residuals": maps.get(name),
             "rounds": [cameras[name] for cameras in result.rounds if name in cameras],
         }
         for index, (name, camera) in enumerate(rig.cameras.items())
     ]
-    lidars = [_lidar_row(result, name) for name in result.lidar_verdicts]
+    lidars = [
+        {
+            "name": name,
+            "anchor": f"lidar-{index}",
+            "verdict": verdict,
+            "moved": moved_cells(result.T_base_lidar[name], guess.T_base_lidar.get(name)),
+            "sigmas": result.error_bar(name),
+        }
+        for index, (name, verdict) in enumerate(result.lidar_verdicts.items())
+    ]
     views, views_left_out = draw_lidars(result) if lidars else (None, "")
     summary = result.summary
     return page_template("calibgraph.report").render(
@@ -98,27 +110,25 @@ def render_page(result: Calibration) -> str:
         matrix_text=matrix_text,
         pose_text=pose_text,
         invert=invert,
-        degrees_and_centimetres=degrees_and_centimetres,
         width_on_page=width_on_page,
         depth_scale=depth_scale(),
         shown=shown,
         overlays_left_out=overlays_left_out,
-        residuals_left_out=not errors,
+        residuals_left_out=not maps,
         config=yaml.safe_dump(result.config.model_dump(), sort_keys=False, allow_unicode=True),
         frames_sentence=FRAMES_SENTENCE,
         tangent_sentence=TANGENT_SENTENCE,
     )
 
 
-def _lidar_row(result: Calibration, name: str) -> dict[str, Any]:
-    guess, moved = result.initial_rig.T_base_lidar, ("-", "-")
-    if name in guess:
-        error = pose_error(result.T_base_lidar[name], guess[name])
-        moved = f"{error.rotation_error_deg:.2f}", f"{error.translation_error_cm:.1f}"
-    return {
-        "name": name, "anchor": f"lidar-{[*result.lidar_verdicts].index(name)}", "moved": moved,
-        "verdict": result.lidar_verdicts[name], "sigmas": result.error_bar(name),
-    }  # fmt: skip
+def _shown_frame(result: Calibration) -> Frame | None:
+    """In the middle of those that were used; None of a result of a table."""
+    return frame_of_entry(result.frames[len(result.frames) // 2]) if result.frames else None
+
+
+def _before_and_after(result: Calibration) -> dict[str, tuple[Camera, Camera]]:
+    guess, found = result.initial_rig.cameras, result.rig.cameras
+    return {name: (camera, found[name]) for name, camera in guess.items()}
 
 
 def _camera_pairs(result: Calibration) -> list[dict[str, Any]]:
@@ -149,13 +159,7 @@ def _export_command(result: Calibration) -> str:
     return shlex.join(words)
 
 
-def write_result(
-    result: Calibration,
-    folder: Path,
-    data: Dataset | None = None,
-    *,
-    with_report: bool = True,
-) -> list[Path]:
+def write_result(result: Calibration, folder: Path, *, with_report: bool = True) -> list[Path]:
     """Write a result in place of an older one: of images with an overlay picture per camera.
 
     After an error none of them appears, and the calibration is the last. Returns the files.
@@ -165,12 +169,9 @@ def write_result(
         written = [result.save(new)]
         tables = (new / CORRESPONDENCES_FILE, new / CAMERA_MATCHES_FILE)
         written += [table for table in tables if table.exists()]
-        if data is not None:
-            middle = data.frames[len(data.frames) // 2]
+        if (shown := _shown_frame(result)) is not None:
             verdicts = {name: one.status for name, one in result.camera_verdicts.items()}
-            written += write_overlays(
-                middle, result.initial_rig, new, final=result.rig, verdicts=verdicts
-            )
+            written += write_overlays(shown, _before_and_after(result), new, verdicts)
         if with_report:
             write_text(new / REPORT_FILE, render_page(result))
             written.append(new / REPORT_FILE)

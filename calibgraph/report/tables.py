@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from calibgraph.arrays import Array
 from calibgraph.model.calibration import FRAMES_SENTENCE, Calibration
 from calibgraph.model.metrics import Evaluation, PoseError, pose_error
 from calibgraph.model.places import describe_places
@@ -118,20 +119,16 @@ def print_summary(console: Console, summary: Summary, details: str) -> None:
 
 def result_table(result: Calibration) -> Table:
     """One row per camera: verdict, change from the guess, residuals and matches."""
-    rows = []
+    rows, guess = [], result.initial_rig.T_camera_lidar
     for name, T in result.T_camera_lidar.items():
-        moved = pose_error(T, result.initial_rig.T_camera_lidar[name])
-        residuals, verdict = result.residuals.get(name), result.camera_verdicts[name]
+        residuals, counts = result.residuals.get(name), result.counts[name]
         rows.append([
-            name,
-            f"[{_COLOURS[verdict.status]}]{verdict.status}[/]",
-            verdict.percent,
-            fixed(moved.rotation_error_deg, 2),
-            fixed(moved.translation_error_cm, 1),
+            *_judged(result, name),
+            *moved_cells(T, guess[name]),
             "-" if residuals is None else fixed(residuals.median_px, 2),
             "-" if residuals is None else f"{residuals.inlier_share:.0%}",
-            str(result.counts[name]["used"]),
-            str(result.counts[name]["frames_used"]),
+            str(counts["used"]),
+            str(counts["frames_used"]),
         ])  # fmt: skip
     numbers = ("off", "moved\ndeg", "moved\ncm", "median\npx", "inliers", "matches", "frames")
     return make_table("Calibration", rows, words=("verdict",), numbers=numbers)
@@ -139,20 +136,29 @@ def result_table(result: Calibration) -> Table:
 
 def lidar_table(result: Calibration) -> Table:
     """One row per LiDAR but the base: verdict, change from the guess, a sigma per axis."""
-    rows, guess = [], result.initial_rig.T_base_lidar
-    for name, verdict in result.lidar_verdicts.items():
-        sigmas, moved = result.error_bar(name), ["-", "-"]
-        if name in guess:
-            error = pose_error(result.T_base_lidar[name], guess[name])
-            moved = [fixed(error.rotation_error_deg, 2), fixed(error.translation_error_cm, 1)]
-        rows.append([
-            name, f"[{_COLOURS[verdict.status]}]{verdict.status}[/]", verdict.percent, *moved,
-            *(["-"] * 6 if sigmas is None else _per_axis(*sigmas)),
-        ])  # fmt: skip
+    guess, T = result.initial_rig.T_base_lidar, result.T_base_lidar
+    rows = [
+        [*_judged(result, name), *moved_cells(T[name], guess.get(name)), *_error_bar(result, name)]
+        for name in result.lidar_verdicts
+    ]
     numbers = ("off", "moved\ndeg", "moved\ncm", *LIDAR_AXES)
     return make_table(
         f"LiDARs in {result.rig.lidar}", rows, names=("LiDAR",), words=("verdict",), numbers=numbers
     )
+
+
+def _judged(result: Calibration, name: str) -> list[str]:
+    """A sensor, its verdict, and the probability that it is off."""
+    verdict = result.verdicts[name]
+    return [name, f"[{_COLOURS[verdict.status]}]{verdict.status}[/]", verdict.percent]
+
+
+def moved_cells(T: Array, guess: Array | None) -> list[str]:
+    """The change of a pose from its guess in degrees and centimetres; dashes without one."""
+    if guess is None:
+        return ["-", "-"]
+    moved = pose_error(T, guess)
+    return [fixed(moved.rotation_error_deg, 2), fixed(moved.translation_error_cm, 1)]
 
 
 def vehicle_table(result: Calibration) -> Table:
@@ -172,15 +178,16 @@ def vehicle_table(result: Calibration) -> Table:
 
 def error_bar_table(result: Calibration) -> Table:
     """One row per camera and per pair of cameras: a standard deviation per axis."""
-    rows = []
-    for name in (*result.covariance, *result.pair_covariance):
-        sigmas = result.error_bar(name)
-        rows.append([name, *(["-"] * 6 if sigmas is None else _per_axis(*sigmas))])
+    names = (*result.covariance, *result.pair_covariance)
+    rows = [[name, *_error_bar(result, name)] for name in names]
     return make_table("Error bar, along the axes of the camera", rows)
 
 
-def _per_axis(degrees: Iterable[float], centimetres: Iterable[float]) -> list[str]:
-    return [fixed(v, 3) for v in degrees] + [fixed(v, 2) for v in centimetres]
+def _error_bar(result: Calibration, name: str) -> list[str]:
+    """A standard deviation per axis in degrees and centimetres; dashes without them."""
+    if (sigmas := result.error_bar(name)) is None:
+        return ["-"] * 6
+    return [fixed(v, 3) for v in sigmas[0]] + [fixed(v, 2) for v in sigmas[1]]
 
 
 def lens_table(result: Calibration) -> Table:

@@ -52,7 +52,7 @@ def create_app(settings: Settings) -> FastAPI:
 @asynccontextmanager
 async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     service: Service = app.state.service
-    service.runner.start()
+    service.start()
     try:
         yield
     finally:
@@ -75,9 +75,8 @@ def require_safe(host: str, *, has_tokens: bool) -> None:
 def serve(app: FastAPI, host: str, port: int, announce: Callable[[str], None]) -> None:
     """Serve an application until SIGTERM or Ctrl-C; announce the URL once it listens."""
     service: Service = app.state.service
-    require_safe(host, has_tokens=service.settings.tokens is not None)
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(message)s")
-    tempfile.tempdir = str(service.folder.arriving)  # uploads arrive on the disk that has room
+    tempfile.tempdir = str(service.arriving)  # uploads arrive on the disk that has room
     try:
         listening = _listen(host, port)
         shown = f"[{host}]" if ":" in host else host

@@ -15,11 +15,11 @@ from calibgraph.child_process import (
     Note,
     Outcome,
     answer_requests,
-    describe_failure,
+    failed,
     memory_limit,
     output_to,
 )
-from calibgraph.errors import CalibrationError, FileError, in_words
+from calibgraph.errors import FileError, in_words
 from calibgraph.files import sha256, write_text
 from calibgraph.io.dataset import load_dataset
 from calibgraph.io.rigs import load_rig
@@ -28,20 +28,18 @@ from calibgraph.model.calibration import Calibration
 from calibgraph.model.result_files import REPORT_FILE
 from calibgraph.pipeline import calibrate, solve
 from calibgraph.progress import Progress
-from calibgraph.report.as_json import finite, result_summary
+from calibgraph.report.as_json import result_summary
 from calibgraph.report.html import write_result
-from calibgraph.service.folders import (
+from calibgraph.service.requests import (
     ARCHIVE,
     FILES,
     INPUT,
     LOG,
+    RIG,
     SCRATCH,
     SUMMARY,
-    WORK,
-)  # fmt: skip
-from calibgraph.service.requests import (
-    RIG,
     TABLE,
+    WORK,
     CalibrationSettings,
     CheckSettings,
     JobProgress,
@@ -49,6 +47,7 @@ from calibgraph.service.requests import (
     SolveSettings,
     recording_name,
 )
+from calibgraph.stdout import finite
 
 _NOTE_EVERY_S = 0.1
 
@@ -67,11 +66,10 @@ def run_job(task: JobTask, note: Note) -> Outcome:
     try:
         return run(task, _progress(note))
     except Exception as error:
-        kind, text = describe_failure(error)
+        places = {f"{task.folder}/{SCRATCH}/": "", str(task.folder): ""}
         if isinstance(error, OSError):  # whose text may name the server's files
-            text = error.strerror or type(error).__name__
-    text = text.replace(f"{task.folder}/{SCRATCH}/", "").replace(str(task.folder), "")
-    return Outcome(error_kind=kind, error=str(CalibrationError(text)))
+            places = {str(error): error.strerror or type(error).__name__}
+        return failed(error, places)
 
 
 def _input(task: JobTask, name: str) -> Path | None:
@@ -104,7 +102,7 @@ def _solve(task: JobTask, progress: Progress) -> Outcome:
     progress("solving", 0, 1)
     result = solve(load_rig(rig), table, settings.config, settings.terms)
     result = replace(result, inputs={str(table): sha256(table)})
-    return _write(task, result, None, with_report=settings.report)
+    return _write(task, result, with_report=settings.report)
 
 
 def _calibrate(task: JobTask, progress: Progress) -> Outcome:
@@ -128,11 +126,11 @@ def _calibrate(task: JobTask, progress: Progress) -> Outcome:
         progress=progress,
     )
     progress("writing", 0, 1)
-    return _write(task, result, data, with_report=settings.report)
+    return _write(task, result, with_report=settings.report)
 
 
-def _write(task: JobTask, result: Calibration, data: Any, *, with_report: bool) -> Outcome:
-    written = write_result(result, task.folder / WORK / FILES, data, with_report=with_report)
+def _write(task: JobTask, result: Calibration, *, with_report: bool) -> Outcome:
+    written = write_result(result, task.folder / WORK / FILES, with_report=with_report)
     _write_summary(task, result_summary(result, [Path(path.name) for path in written]))
     return Outcome((result.verdict.status, result.verdict.cannot_tell))
 

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from calibgraph.child_process import ErrorKind, Outcome
-from calibgraph.errors import CalibrationError
+from calibgraph.errors import CalibrationError, FileError
 from calibgraph.service.requests import Job, JobKind, JobProgress
 
 JobState = Literal["queued", "running", "succeeded", "failed", "cancelled"]
@@ -19,9 +19,9 @@ MOST_STARTS = 5
 """A job during which the process or the server ended so often is not started again."""
 
 DATABASE = "service.sqlite"
-_WAIT_S = 30.0
-_ENDED = "state IN ('succeeded', 'failed', 'cancelled')"
+_ENDED = f"state IN {FINISHED}"
 _SCHEMA = """
+PRAGMA locking_mode = EXCLUSIVE;  -- against a second server
 PRAGMA journal_mode = WAL;
 PRAGMA synchronous = FULL;  -- what is acknowledged is on disk
 CREATE TABLE IF NOT EXISTS calibgraph_jobs (
@@ -54,9 +54,9 @@ class JobRecord(BaseModel):
     state: JobState
     request: Annotated[str, Field(exclude=True)]
     name: str
-    created: datetime
-    started: datetime | None
-    finished: datetime | None
+    created: Annotated[datetime, Field(validation_alias="created_s")]
+    started: Annotated[datetime | None, Field(validation_alias="started_s")]
+    finished: Annotated[datetime | None, Field(validation_alias="finished_s")]
     starts: Annotated[int, Field(exclude=True)]
     verdict: str | None
     cannot_tell: bool | None
@@ -70,31 +70,28 @@ class JobRecord(BaseModel):
         return self.state in FINISHED
 
 
-_COLUMNS = (
-    "number, id, kind, state, request, name, created_s AS created, started_s AS started, "
-    "finished_s AS finished, starts, verdict, cannot_tell, error_kind, error"
-)
-
-
 class JobTable:
-    """The jobs of a server.
+    """The jobs of a server, locked against a second one.
 
     Args:
         folder: of the database.
 
     Raises:
-        CalibrationError: if it cannot be opened.
+        CalibrationError: if it cannot be opened, or another server uses it.
     """
 
     def __init__(self, folder: Path) -> None:
         path, self._using = folder / DATABASE, threading.Lock()
         try:
             self._connection = sqlite3.connect(
-                path, _WAIT_S, check_same_thread=False, isolation_level=None
+                path, timeout=0, check_same_thread=False, isolation_level=None
             )
             self._connection.row_factory = sqlite3.Row
             self._connection.executescript(_SCHEMA)
         except sqlite3.Error as error:
+            if error.sqlite_errorcode == sqlite3.SQLITE_BUSY:
+                why = "is in use by another server; stop that one, or give another --data"
+                raise FileError(folder, why) from None
             raise CalibrationError(f"{path}: cannot be opened ({error}); move it away") from error
 
     def run(self, statement: str, **values: Any) -> list[Any]:
@@ -110,7 +107,7 @@ class JobTable:
         """Add a job; it is durable when this returns."""
         (row,) = self.run(
             "INSERT INTO calibgraph_jobs (id, kind, state, request, name, created_s, starts) "
-            f"VALUES (:id, :kind, 'queued', :request, :name, :now, 0) RETURNING {_COLUMNS}",
+            "VALUES (:id, :kind, 'queued', :request, :name, :now, 0) RETURNING *",
             id=id, kind=job.kind, request=job.model_dump_json(), name=job.name, now=time.time(),
         )  # fmt: skip
         return JobRecord(**row)
@@ -126,7 +123,7 @@ class JobTable:
         return self._select(f"{where} ORDER BY number DESC LIMIT :most", most=most, before=before)
 
     def _select(self, where: str, **values: Any) -> list[JobRecord]:
-        rows = self.run(f"SELECT {_COLUMNS} FROM calibgraph_jobs {where}", **values)
+        rows = self.run(f"SELECT * FROM calibgraph_jobs {where}", **values)
         return [JobRecord(**row) for row in rows]
 
     def counts(self) -> dict[JobState, int]:
@@ -138,7 +135,7 @@ class JobTable:
         rows = self.run(
             "UPDATE calibgraph_jobs SET state = 'running', started_s = :now, starts = starts + 1 "
             "WHERE number = (SELECT min(number) FROM calibgraph_jobs WHERE state = 'queued') "
-            f"RETURNING {_COLUMNS}", now=time.time()
+            "RETURNING *", now=time.time()
         )  # fmt: skip
         return JobRecord(**rows[0]) if rows else None
 

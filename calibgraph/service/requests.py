@@ -27,6 +27,12 @@ PARTS: Mapping[JobKind, Mapping[str, bool]] = {
 """The inputs of each kind, and whether they are required."""
 MAX_RECORDINGS = 100
 
+INPUT, SCRATCH, WORK, RESULT, LOG = "input", "scratch", "work", "result", "log.txt"
+"""In a job's folder: its input, its working folder, its result as it is written, then; its log."""
+
+FILES, ARCHIVE, SUMMARY = "files", "files.zip", "summary.json"
+"""In the result: the files that the command writes, all of them, the summary that it prints."""
+
 
 def _printable(text: object) -> object:
     """A text on one line, without characters that command a terminal or turn text around."""

@@ -1,22 +1,42 @@
-"""Routes of jobs and of their results, of trackers, the page and health."""
+"""Routes of jobs, their forms and results, of trackers, the page and health."""
 
 import asyncio
+import secrets
+import shutil
 import time
+from pathlib import Path
 from typing import Annotated, Literal
 
 from fastapi import APIRouter, Depends, Query, Request
 from fastapi.responses import FileResponse, HTMLResponse, PlainTextResponse, Response
-from pydantic import BaseModel, StringConstraints
+from pydantic import BaseModel, StringConstraints, ValidationError
 from starlette.concurrency import run_in_threadpool
+from starlette.datastructures import FormData, UploadFile
 
+from calibgraph.files import describe
 from calibgraph.model.result_files import REPORT_FILE
 from calibgraph.report.kit import page_template
-from calibgraph.service.folders import ARCHIVE, FILES, LOG, RESULT, SUMMARY
 from calibgraph.service.jobs import JobRecord
 from calibgraph.service.problems import Problem
-from calibgraph.service.requests import RECORDING, RIG, TABLE, TEXTS, JobKind
+from calibgraph.service.requests import (
+    ARCHIVE,
+    FILES,
+    INPUT,
+    LOG,
+    MAX_RECORDINGS,
+    PARTS,
+    RECORDING,
+    RESULT,
+    RIG,
+    SETTINGS_OF,
+    SUMMARY,
+    TABLE,
+    TEXTS,
+    Job,
+    JobKind,
+    recording_name,
+)
 from calibgraph.service.state import Service, service_of
-from calibgraph.service.uploads import receive_job
 
 State = Annotated[Service, Depends(service_of)]
 Before = Annotated[int | None, Query(ge=0, le=2**62)]
@@ -32,6 +52,7 @@ REPORT_POLICY = (
 _LONGEST_WAIT_S = 60.0
 _LONGEST_PAUSE_S = 0.5
 _MOST_LOG = 2**20
+_MOST_TEXT_BYTES = 10**6
 
 
 class JobList(BaseModel):
@@ -42,7 +63,7 @@ class JobList(BaseModel):
 
 
 def _answer(record: JobRecord, state: Service) -> JobRecord:
-    return record.model_copy(update={"progress": state.runner.steps.get(record.id)})
+    return record.model_copy(update={"progress": state.steps.get(record.id)})
 
 
 _FILE = {"type": "string", "format": "binary"}
@@ -59,10 +80,62 @@ async def submit(kind: JobKind, request: Request, response: Response, state: Sta
     """Ask for a job: a form with files, and settings as JSON."""
     size = int(request.headers.get("content-length", "0"))
     await run_in_threadpool(state.require_room, size)
-    id, job = await receive_job(request, kind, state.folder)
-    record = await run_in_threadpool(state.add, id, job)
-    response.headers["Location"] = f"/v1/jobs/{id}"
+    record = await _receive_job(request, kind, state)
+    response.headers["Location"] = f"/v1/jobs/{record.id}"
     return _answer(record, state)
+
+
+async def _receive_job(request: Request, kind: JobKind, state: Service) -> JobRecord:
+    """Read the form of a job, and add the job."""
+    if not request.headers.get("content-type", "").startswith("multipart/form-data"):
+        raise Problem(415, "send a form: multipart/form-data")
+    most = {"max_files": MAX_RECORDINGS + 2, "max_fields": MAX_RECORDINGS + 5}
+    try:
+        async with request.form(**most, max_part_size=_MOST_TEXT_BYTES) as form:
+            return await run_in_threadpool(_add, form, kind, state)
+    except LookupError as error:
+        raise Problem(400, f"the form cannot be read ({error})") from error
+
+
+def _add(form: FormData, kind: JobKind, state: Service) -> JobRecord:
+    """Add a job whose folder has the files of a form."""
+    arriving = state.arriving / secrets.token_hex(16)
+    (arriving / INPUT).mkdir(parents=True, mode=0o700)
+    try:
+        job = _job_of(form, kind, arriving / INPUT)
+        (arriving / LOG).touch()
+        return state.add(arriving, job)
+    finally:
+        shutil.rmtree(arriving, ignore_errors=True)
+
+
+def _job_of(form: FormData, kind: JobKind, folder: Path) -> Job:
+    """The job of a form; files are written, texts are settings or words for people."""
+    texts, counts = dict[str, str](), dict[str, int]()
+    for name, value in form.multi_items():
+        if name in TEXTS and isinstance(value, str):
+            texts[name] = value
+            continue
+        if name not in PARTS[kind]:
+            known = ", ".join((*PARTS[kind], *TEXTS))
+            raise Problem(422, f"unknown field {name[:60]!r}; known are {known}")
+        count = counts[name] = counts.get(name, 0) + 1
+        if count > (MAX_RECORDINGS if name == RECORDING else 1):
+            raise Problem(422, f"{name!r} is given {count} times")
+        target = recording_name(count - 1) if name == RECORDING else name
+        if not isinstance(value, UploadFile):
+            raise Problem(422, f"{name!r} is a text; send it as a file")
+        with (folder / target).open("xb") as file:
+            shutil.copyfileobj(value.file, file, 2**20)
+    for name, is_required in PARTS[kind].items():
+        if is_required and name not in counts:
+            raise Problem(422, f"{name!r} is missing; add it as a file")
+    try:
+        settings = SETTINGS_OF[kind].model_validate_json(texts.pop("settings", "") or "{}")
+        recordings, kept = counts.get(RECORDING, 0), settings.model_dump(mode="json")
+        return Job(kind=kind, recordings=recordings, settings=kept, **texts)
+    except ValidationError as error:
+        raise Problem(422, describe(error)) from error
 
 
 @router.get("/v1/jobs")
@@ -103,7 +176,7 @@ async def get_job(
 def cancel_job(id: str, state: State) -> JobRecord:
     """Cancel a job that waits or runs."""
     _found(state, id)
-    if not state.runner.cancel(id):
+    if not state.cancel(id):
         raise Problem(409, "the job is finished")
     return _answer(_found(state, id), state)
 
@@ -112,12 +185,12 @@ def cancel_job(id: str, state: State) -> JobRecord:
 def job_log(id: str, state: State) -> str:
     """What the job printed: its last part."""
     _found(state, id)
-    folder = state.folder.of_job(id)
+    folder = state.of_job(id)
     try:
         text = (folder / LOG).read_bytes()[-_MOST_LOG:].decode(errors="replace")
     except FileNotFoundError:  # it expires at this moment
         return ""
-    return text.replace(str(folder), "").replace(str(state.folder.path), "")
+    return text.replace(str(folder), "").replace(str(state.path), "")
 
 
 _RESULTS = {
@@ -135,7 +208,7 @@ def result(id: str, part: Literal["result", "report.html", "files.zip"], state: 
         why = f" ({record.error})" if record.error else ""
         raise Problem(409, f"the job has no result: it is {record.state}{why}")
     name, media_type = _RESULTS[part]
-    path = state.folder.of_job(id) / RESULT / name
+    path = state.of_job(id) / RESULT / name
     if not path.exists():
         raise Problem(404, "no such file: it was not asked for, or has been removed")
     policy = {"Content-Security-Policy": REPORT_POLICY} if part == "report.html" else {}

@@ -10,13 +10,14 @@ from pathlib import Path
 
 import pyarrow as pa
 
-from calibgraph.child_process import answer_requests, describe_failure, memory_limit
+from calibgraph.child_process import answer_requests, failed, memory_limit
 from calibgraph.errors import CalibrationError, MotionError
 from calibgraph.files import sync_to_disk, write_bytes, write_text
 from calibgraph.io.rigs import load_rig
 from calibgraph.io.tables import from_arrow
 from calibgraph.model.config import config_from
-from calibgraph.report.as_json import finite, result_summary
+from calibgraph.report.as_json import result_summary
+from calibgraph.stdout import finite
 from calibgraph.tracking import DurableCalibrator, warm_up_tracker
 from calibgraph.tracking.assessment import json_lines
 from calibgraph.tracking.frames import Item, frames_of_lines, frames_of_table
@@ -53,9 +54,9 @@ def answer(held: Held, request: tuple[str, Path, bytes, str]) -> tuple[int, str]
             return 200, json.dumps(finite(state))
         is_gone, status, text = True, 200, "null"
     except Exception as error:
-        kind, text = describe_failure(error)
-        text = text.replace(f"{folder}/", "").replace(str(folder), "the tracker")
-        status = {"bad input": 422, "out of memory": 413, "io": 507}.get(kind, 500)
+        how = failed(error, {f"{folder}/": "", str(folder): "the tracker"})
+        status = {"bad input": 422, "out of memory": 413, "io": 507}.get(str(how.error_kind), 500)
+        text = str(how.error)
     if folder in held:
         held.pop(folder).abandon()
     if is_gone:

@@ -14,7 +14,7 @@ from calibgraph.model.calibration import Calibration
 from calibgraph.model.geometry import invert, pair_covariances, pose_rows
 from calibgraph.model.summary import summarize
 from calibgraph.model.verdict import START, Check, Verdict
-from calibgraph.report.as_json import finite
+from calibgraph.stdout import finite
 from calibgraph.tracking.estimate import Estimate
 from calibgraph.tracking.events import Event
 from calibgraph.tracking.frames import StreamFrame

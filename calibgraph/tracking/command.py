@@ -17,7 +17,7 @@ from calibgraph.model.calibration import Calibration
 from calibgraph.model.config import Config
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import START
-from calibgraph.report.as_json import print_line, require_stdout
+from calibgraph.stdout import print_line, require_stdout
 from calibgraph.tracking.assessment import Update, json_lines
 from calibgraph.tracking.durable import DurableCalibrator
 from calibgraph.tracking.frames import Item, frames_of

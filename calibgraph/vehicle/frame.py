@@ -54,14 +54,14 @@ Measured = tuple[Array, Array]
 
 
 def find_vehicle(
-    stated: Vehicle, road: Road | None, travel: Travel | None
+    stated: Vehicle, road: Road | None, travel: Travel
 ) -> tuple[Vehicle, tuple[str, ...]]:
     """The vehicle with T_vehicle_lidar and its sigmas, and a line on each axis that is unknown.
 
     Args:
         stated: what is known.
         road: in the axes of the base LiDAR, if it was seen.
-        travel: likewise, if there are poses.
+        travel: likewise.
     """
     T = _start(stated, road, travel)
     for _ in range(_ROUNDS):
@@ -117,13 +117,12 @@ def _plane(cloud: Array, T_up_base: Array) -> Array | None:
     return np.append(T_up_base[:3, :3].T @ normal, height_m)
 
 
-def _start(stated: Vehicle, road: Road | None, travel: Travel | None) -> Array:
+def _start(stated: Vehicle, road: Road | None, travel: Travel) -> Array:
     """(4, 4) what is stated, else from the road and the direction of travel."""
     if stated.T_vehicle_lidar is not None:
         return np.array(stated.T_vehicle_lidar)
     z = np.array([0.0, 0.0, 1.0]) if road is None else road.normal
-    ahead = np.array([1.0, 0.0, 0.0]) if travel is None else _direction(travel)
-    y = np.cross(z, ahead)
+    y = np.cross(z, travel.direction)
     y /= np.linalg.norm(y)
     return transform(np.array([np.cross(y, z), y, z]))
 
@@ -148,19 +147,12 @@ def _by_road(T: Array, road: Road | None) -> Measured:
     return steps, information
 
 
-def _by_travel(T: Array, travel: Travel | None) -> Measured:
+def _by_travel(T: Array, travel: Travel) -> Measured:
     """Pitch and yaw by which the direction of travel is the x axis; x from turns."""
     steps, information = np.zeros(6), np.zeros(6)
-    if travel is not None:
-        x, y, z = T[:3, :3] @ _direction(travel)
-        steps[1:3] = np.arctan2(z, np.hypot(x, y)), -np.arctan2(y, x)
-        sigmas = np.array([travel.pitch_sigma_rad, travel.yaw_sigma_rad])
-        information[1:3] = np.where(sigmas < _TOLD, np.maximum(sigmas, _LEAST_SIGMA) ** -2.0, 0.0)
-        steps[3], information[3] = travel.ahead_m - T[0, 3], travel.ahead_sigma_m**-2.0
+    x, y, z = T[:3, :3] @ travel.direction
+    steps[1:3] = np.arctan2(z, np.hypot(x, y)), -np.arctan2(y, x)
+    sigmas = np.array([travel.pitch_sigma_rad, travel.yaw_sigma_rad])
+    information[1:3] = np.where(sigmas < _TOLD, np.maximum(sigmas, _LEAST_SIGMA) ** -2.0, 0.0)
+    steps[3], information[3] = travel.ahead_m - T[0, 3], travel.ahead_sigma_m**-2.0
     return steps, information
-
-
-def _direction(travel: Travel) -> Array:
-    """(3,) unit vector in the axes of the LiDAR."""
-    yaw, pitch = travel.yaw_rad, travel.pitch_rad
-    return np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), -np.sin(pitch)])

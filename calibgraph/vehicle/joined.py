@@ -2,10 +2,8 @@
 
 Where the base alone shows cameras too little, these are matched with the clouds of all LiDARs.
 
-Clouds are joined in the base, by the poses found. A point of another LiDAR errs by that pose: with
-H the Hessian of a camera's matches, H_l that of those with points of LiDAR l, and eta the error of
-its pose, p_base = exp(eta) T_base_lidar p_lidar, a camera errs by xi = - H^-1 H_l Ad(T) eta, with
-T_camera_lidar = exp(xi) estimate. So cameras and LiDARs have one covariance.
+Clouds are joined in the base, by the poses found, whose errors are a part of those of cameras
+(``matching.joined_clouds``). So cameras and LiDARs have one covariance.
 
 LiDARs that share nothing may show the same cameras. Each camera i is then calibrated to both, and
 T_base_lidar = T_i_base^-1 T_i_lidar with the error Ad(T_i_base^-1) (xi_i_lidar - xi_i_base): the
@@ -16,34 +14,26 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
-from scipy.spatial import cKDTree
 
 from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError
 from calibgraph.io.dataset import Dataset, spread_out
 from calibgraph.io.frame import Frame
-from calibgraph.matching.protocol import FullMatcher
 from calibgraph.model.calibration import Calibration
-from calibgraph.model.config import Config, LensPart
-from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.geometry import (
     adjoints,
     invert,
-    pose_rows,
     retract_all,
-    transform,
+    rows_of_poses,
     twist_between,
 )
 from calibgraph.model.rig import Camera, Rig
-from calibgraph.progress import Progress
-from calibgraph.solver.matches import camera_block
-from calibgraph.solver.within_place import WEAK
 from calibgraph.vehicle.lidars import LidarPoses
+from calibgraph.vehicle.sums import step_twists
 
 Cloud = NDArray[np.float32]
 
@@ -86,7 +76,14 @@ def join_clouds(
     seen = ", ".join(f"{name} {share:.0%}" for name, share in poor.items())
     line = f"clouds of {rig.lidar}, {', '.join(joined)} are joined for cameras, since {rig.lidar} "
     line += f"alone shows of what all show: {seen}"
-    return replace(data, frames=frames), line
+    return replace(data, frames=frames, lidar_errors=lidar_errors(poses)), line
+
+
+def lidar_errors(poses: LidarPoses) -> dict[str, Array]:
+    """Per LiDAR but the base, (6, 6 k) its twist by a standard deviation of each of the errors."""
+    turns = step_twists(np.array([poses.T_base_lidar[name] for name in poses.covariance]))
+    each = np.split(turns @ poses.root, len(poses.covariance))
+    return dict(zip(poses.covariance, each, strict=True))
 
 
 def place_by_cameras(
@@ -126,7 +123,7 @@ def place_by_cameras(
     to_base = block_diag(*adjoints(T_lidar_camera))
     covariance = to_base @ (_joint(base, found) + _joint(other, found)) @ to_base.T
     T_base_lidar, own, ratio = _mean_pose(T, covariance)
-    turn = np.linalg.inv(_turn_at(T_base_lidar))
+    turn = np.linalg.inv(step_twists(T_base_lidar[None]))
     poses, joint = {rig.lidar: np.eye(4), name: T_base_lidar}, turn @ own @ turn.T
     return LidarPoses(rig.lidar, poses, joint, {}, len(data.frames), (ratio, ratio))
 
@@ -148,8 +145,7 @@ def _joint(result: Calibration, cameras: Sequence[str]) -> Array:
     """(6 n, 6 n) of some cameras; as independent where another one is not determined."""
     if result.joint_covariance is None:
         return np.asarray(block_diag(*(result.covariance[name] for name in cameras)))
-    names = [*result.rig.cameras]
-    rows = np.concatenate([np.r_[pose_rows(names.index(name))] for name in cameras])
+    rows = rows_of_poses(cameras, [*result.rig.cameras])
     return np.asarray(result.joint_covariance[np.ix_(rows, rows)])
 
 
@@ -217,107 +213,14 @@ def _cells(camera: Camera, cloud: Cloud) -> int:
     return len(np.unique(cells[inside], axis=0))
 
 
-class JoinedMatcher:
-    """A matcher on joined clouds: its tables have the errors of cameras by those of LiDARs."""
-
-    def __init__(self, matcher: FullMatcher, poses: LidarPoses) -> None:
-        self._matcher, self._poses = matcher, poses
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("_"):  # of a copy that is being made
-            raise AttributeError(name)
-        return getattr(self._matcher, name)
-
-    def with_estimate(self, parts: Sequence[LensPart]) -> JoinedMatcher:
-        """The matcher for solves that estimate these parts of lens and clock."""
-        made = self._matcher.with_estimate(parts)
-        return self if made is self._matcher else JoinedMatcher(made, self._poses)
-
-    def match(
-        self, dataset: Dataset, rig: Rig, *, round_index: int, progress: Progress
-    ) -> Correspondences:
-        """The correspondences, with what LiDARs add to the error bars in their findings."""
-        table = self._matcher.match(dataset, rig, round_index=round_index, progress=progress)
-        errors = errors_by_lidars(table, dataset.frames, rig, self._poses)
-        content = {name: columns.tolist() for name, columns in errors.items()}
-        return table.with_findings(replace(table.findings, by_lidars=content))
-
-
-def errors_by_lidars(
-    table: Correspondences, frames: Sequence[Frame], rig: Rig, poses: LidarPoses
-) -> dict[str, Array]:
-    """Per camera, (6, 6 k) xi by a standard deviation of each of the errors of k LiDARs.
-
-    Args:
-        table: with points of joined clouds.
-        frames: that they are from.
-        rig: where the cameras are.
-        poses: of the LiDARs.
-    """
-    names, found = [*poses.covariance], {}
-    turns = block_diag(*(_turn_at(poses.T_base_lidar[name]) for name in names))
-    twists, sources = turns @ _root(poses), _sources(table, frames, names)
-    for number, name in enumerate(table.cameras):
-        rows = np.flatnonzero(table.camera_index == number)
-        if len(rows) == 0:
-            continue
-        order = rows[np.argsort(table.frame[rows], kind="stable")]
-        camera, own = rig.cameras[name], sources[order]
-        block = camera_block(camera, table.select(order), Config()).block
-        T = camera.T_camera_lidar[None]
-        hessian = block.summarize(T).hessian[0] + WEAK
-        parts = [
-            block.select(own == k).summarize(T).hessian[0] if (own == k).any() else np.zeros((6, 6))
-            for k in range(len(names))
-        ]
-        by_poses = np.linalg.solve(hessian, np.hstack([part @ adjoints(T)[0] for part in parts]))
-        found[name] = -by_poses @ twists
-    return found
-
-
-def _turn_at(T_base_lidar: Array) -> Array:
-    """(6, 6) from a rotation omega and a shift of the position t to (omega, shift + t x omega)."""
-    shifted = transform(np.eye(3), T_base_lidar[:3, 3])
-    return np.asarray(adjoints(shifted[None])[0])
-
-
-def _root(poses: LidarPoses) -> Array:
-    """(6 k, 6 k) Cholesky root of the covariance of all rotations and positions."""
-    exact = 1e-18 * np.eye(len(poses.joint_covariance))  # for rounding
-    return np.asarray(np.linalg.cholesky(poses.joint_covariance + exact))
-
-
-def _sources(table: Correspondences, frames: Sequence[Frame], names: Sequence[str]) -> Array:
-    """(n,) the number of the LiDAR whose point is nearest to each match's, -1 of the base."""
-    found = np.full(len(table), -1)
-    for frame in frames:
-        rows = np.flatnonzero(table.frame == frame.index)
-        if not len(rows):
-            continue
-        points = table.points_lidar_m[rows]
-        nearest = _distances(replace(frame, joined={}, kept=None).load_cloud(), points)
-        for number, name in enumerate(names):
-            cloud = frame.load_in_base(name) if name in frame.joined else None
-            if cloud is not None:
-                away = _distances(cloud, points)
-                found[rows[away < nearest]] = number
-                nearest = np.minimum(nearest, away)
-    return found
-
-
-def _distances(cloud: Cloud, points: Array) -> Array:
-    return np.asarray(cKDTree(cloud[:, :3]).query(points)[0])
-
-
-def joint_covariance(cameras: Array, by_lidars: Array, poses: LidarPoses) -> Array:
-    """(6 N + 6 k) of cameras and LiDARs, with rotations and positions of these, in the base.
+def joint_covariance(cameras: Array, by_lidars: Array, lidars: Array, root: Array) -> Array:
+    """(6 N + 6 k) of cameras and LiDARs.
 
     Args:
         cameras: (6 N, 6 N) with the part by the poses of LiDARs.
-        by_lidars: (6 N, 6 k) by :func:`errors_by_lidars`, or (6 N, 0).
-        poses: of the LiDARs.
+        by_lidars: (6 N, 6 k) by a standard deviation of each error of these, or (6 N, 0).
+        lidars: (6 k, 6 k) of them.
+        root: (6 k, 6 k) by a standard deviation of each of the errors.
     """
-    across = np.zeros((len(cameras), len(poses.joint_covariance)))
-    if by_lidars.size:
-        across = by_lidars @ _root(poses).T
-    return np.block([[cameras, across], [across.T, poses.joint_covariance]])
+    across = by_lidars @ root.T if by_lidars.size else np.zeros((len(cameras), len(lidars)))
+    return np.block([[cameras, across], [across.T, lidars]])

@@ -12,17 +12,19 @@ the covariance is wider by that.
 
 from __future__ import annotations
 
-from collections.abc import Container, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import permutations
 
 import numpy as np
 import scipy.linalg
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError
+from calibgraph.model.geometry import rows_of_poses
 from calibgraph.vehicle.planes import Planes, Views, moved
 from calibgraph.vehicle.sums import MATCH, Matches, Sums, residuals_m, sum_up
 
@@ -78,17 +80,15 @@ class LidarPoses:
         In the base's axes: R = exp(rotation) R_estimate, t = t_estimate + translation, t being the
         position of the LiDAR.
         """
-        rows = [slice(6 * row, 6 * row + 6) for row in range(len(self.T_base_lidar) - 1)]
         names = [name for name in self.T_base_lidar if name != self.base]
-        return {n: self.joint_covariance[of, of] for n, of in zip(names, rows, strict=True)}
+        blocks = self.joint_covariance.reshape(len(names), 6, len(names), 6)
+        return {name: blocks[row, :, row] for row, name in enumerate(names)}
 
-    def without(self, names: Container[str]) -> LidarPoses:
-        """The poses of the others."""
-        kept = [row for row, name in enumerate(self.covariance) if name not in names]
-        rows = [6 * row + axis for row in kept for axis in range(6)]
-        T = {name: own for name, own in self.T_base_lidar.items() if name not in names}
-        return replace(
-            self, T_base_lidar=T, joint_covariance=self.joint_covariance[np.ix_(rows, rows)]
+    @property
+    def root(self) -> Array:
+        """(6 k, 6 k) Cholesky root of the joint covariance."""
+        return np.asarray(
+            np.linalg.cholesky(self.joint_covariance + _EXACT * np.eye(6 * len(self.covariance)))
         )
 
 
@@ -131,23 +131,21 @@ def calibrate_lidars(
 
 
 def join_poses(parts: Sequence[LidarPoses], names: Sequence[str]) -> LidarPoses:
-    """Poses that were found independently of each other, in the order of names, the base first."""
-    order = [names.index(name) - 1 for part in parts for name in part.covariance]
-    rows = [6 * number + axis for number in order for axis in range(6)]
-    joint = np.zeros((len(rows), len(rows)))
-    joint[np.ix_(rows, rows)] = scipy.linalg.block_diag(*(part.joint_covariance for part in parts))
+    """Poses that were found independently of each other; where one is in several, the last counts.
+
+    In the order of names, the base first.
+    """
+    of = {name: part for part in parts for name in part.covariance}
+    joint = np.zeros((6 * len(of), 6 * len(of)))
+    for part in parts:
+        kept = [name for name in part.covariance if of[name] is part]
+        to, rows = (rows_of_poses(kept, [*order]) for order in (names[1:], part.covariance))
+        joint[np.ix_(to, to)] = part.joint_covariance[np.ix_(rows, rows)]
     return LidarPoses(
         names[0],
-        {
-            name: next(p.T_base_lidar[name] for p in parts if name in p.T_base_lidar)
-            for name in names
-        },
+        {name: of[name].T_base_lidar[name] if name in of else np.eye(4) for name in names},
         joint,
-        {
-            name: min(p.matched[name] for p in parts if name in p.matched)
-            for name in names
-            if any(name in p.matched for p in parts)
-        },
+        {name: part.matched[name] for name, part in of.items() if name in part.matched},
         min(part.places for part in parts),
         (max(p.place_ratios[0] for p in parts), max(p.place_ratios[1] for p in parts)),
     )
@@ -170,7 +168,8 @@ def refine_poses(
     for number in range(first, rounds):
         is_last = number >= len(_GATES_M)
         gate_m = _LAST_GATE_M if is_last else _GATES_M[number]
-        matches = _match(planes, T, gate_m, _FINE_COSINE if number > 1 else _COARSE_COSINE)
+        found, cosine = _nearest(planes, T), _FINE_COSINE if number > 1 else _COARSE_COSINE
+        matches = found[_are_same(found, gate_m, cosine)]
         _require_overlap(matches, names)
         sums = sum_up(matches, T, _scale_m(matches, 0.0 if is_last else _WIDTH * gate_m))
         step = _step(sums)
@@ -203,18 +202,14 @@ def _stepped(T_base_lidar: Array, steps: Array) -> Array:
     return T
 
 
-def _match(
-    planes: Sequence[Sequence[Planes]], T_base_lidar: Array, gate_m: float, cosine: float
-) -> Matches:
-    """Each plane with the nearest one of every other LiDAR, if that can be the same."""
-    found = _nearest(planes, T_base_lidar)
+def _are_same(found: Matches, gate_m: float, cosine: float) -> NDArray[np.bool_]:
+    """Which can be pieces of one plane."""
     plane, other = found["plane"], found["of_other"]
     apart = plane["center_m"] - other["center_m"]
     across = (other["normal"] * apart).sum(axis=1)
     along = np.sqrt(np.maximum((apart**2).sum(axis=1) - across**2, 0.0))
     same = (along < np.maximum(plane["radius_m"], other["radius_m"])) & (np.abs(across) < gate_m)
-    same &= (plane["normal"] * other["normal"]).sum(axis=1) > cosine
-    return np.asarray(found[same])
+    return np.asarray(same & ((plane["normal"] * other["normal"]).sum(axis=1) > cosine))
 
 
 def _nearest(planes: Sequence[Sequence[Planes]], T_base_lidar: Array) -> Matches:
@@ -246,8 +241,7 @@ def count_matched(
     beside = (apart**2).sum(axis=1) < np.maximum(plane["radius_m"], other["radius_m"]) ** 2
     if up is not None:
         beside &= np.abs(plane["normal"] @ up) < _UPRIGHT
-    on_it = beside & (np.abs((other["normal"] * apart).sum(axis=1)) < _LAST_GATE_M)
-    on_it &= (plane["normal"] * other["normal"]).sum(axis=1) > _FINE_COSINE
+    on_it = beside & _are_same(found, _LAST_GATE_M, _FINE_COSINE)
     near, on = (_per_lidar(found[of], len(T_base_lidar)) for of in (beside, on_it))
     return near, on
 
@@ -260,7 +254,8 @@ def _per_lidar(matches: Matches, count: int) -> Array:
 
 def _require_overlap(matches: Matches, names: Sequence[str]) -> None:
     """One line if a LiDAR has too few matches."""
-    for name, count in zip(names, _per_lidar(matches, len(names)), strict=True):
+    counts = _per_lidar(matches, len(names))
+    for name, count in zip(names[::-1], counts[::-1], strict=True):  # the base shares with all
         if count < _LEAST_MATCHES:
             raise CalibrationError(
                 f"LiDAR {name!r} sees {count:.0f} planes that others see, at least "

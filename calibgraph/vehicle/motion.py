@@ -24,7 +24,7 @@ from calibgraph.io.bags import MESSAGE_SUFFIX
 from calibgraph.io.frame import Frame, ScanSteps, twist_by_scans
 from calibgraph.model.geometry import invert, move_points
 from calibgraph.vehicle.lidars import refine_poses
-from calibgraph.vehicle.planes import Planes, View, find_planes, moved, thinned
+from calibgraph.vehicle.planes import PLANE, View, find_planes, thinned
 from calibgraph.vehicle.travel import read_poses
 from factors import displace
 
@@ -102,28 +102,26 @@ class Drive:
         None where the motion is unknown, or the drive begins or ends within the reach.
         """
         T_map_base = self._around(number)
-        points, planes, drift = list[Array](), list[Planes](), {True: np.eye(4), False: np.eye(4)}
+        seen, views = View(np.empty((0, 3)), np.empty(0, PLANE)), 0
+        drift = {True: np.eye(4), False: np.eye(4)}
         for other, T_odometry in sorted(T_map_base.items(), key=lambda of: abs(of[0] - number)):
             instant = self.instant(other, [base])
             if not instant.is_usable:
                 continue
             cloud = instant.at_stamp(base, np.eye(4))
-            own = thinned(find_planes(cloud), _MOST_PLANES)
+            own = View(cloud, thinned(find_planes(cloud), _MOST_PLANES))
             T = drift[other > number] @ T_odometry  # as that of the one beside it
-            if planes:
-                known, both = np.concatenate(planes), np.array([np.eye(4), T])
+            if views:
+                planes, both = [[seen.planes], [own.planes]], np.array([np.eye(4), T])
                 try:
-                    (_, T), sums = refine_poses([[known], [own]], both, (base, base), first=_FIRST)
+                    (_, T), sums = refine_poses(planes, both, (base, base), first=_FIRST)
                 except CalibrationError:  # too few planes
                     continue
                 if sums.basis().shape[1] < len(_STILL):  # a direction is open
                     continue
                 drift[other > number] = T @ invert(T_odometry)
-            points.append(move_points(cloud, T))
-            planes.append(moved(own, T))
-        if len(planes) <= 1:
-            return None
-        return View(np.concatenate(points), np.concatenate(planes)), max(T_map_base)
+            seen, views = seen.joined(own, T), views + 1
+        return (seen, max(T_map_base)) if views > 1 else None
 
     def _around(self, number: int) -> dict[int, Array]:
         """(4, 4) T_number_frame of frames some metres apart; empty if they end before the reach."""

@@ -53,6 +53,11 @@ class View(NamedTuple):
     points_m: Array
     planes: Planes
 
+    def joined(self, other: View, T: Array) -> View:
+        """With what another one sees, whose frame is at (4, 4) in this one's."""
+        points = np.concatenate([self.points_m, move_points(other.points_m, T)])
+        return View(points, np.concatenate([self.planes, moved(other.planes, T)]))
+
 
 Views = Mapping[str, Sequence[View]]
 """Per LiDAR, one of each instant; the same instants."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +35,7 @@ from calibgraph.vehicle.lidars import (
 from calibgraph.vehicle.motion import REACH_M, Drive, Instant
 from calibgraph.vehicle.planes import View, Views, look
 from calibgraph.vehicle.start import locate_lidars
-from calibgraph.vehicle.travel import POSE_FILES, direction_of_travel, read_poses
+from calibgraph.vehicle.travel import POSE_FILES, Travel, direction_of_travel, read_poses
 
 MOST_INSTANTS = 20
 """Of a recording, spread over it: more hardly narrow what places differ by."""
@@ -100,7 +101,8 @@ def calibrate_rig_lidars(
     warnings = []
     if left := len(dataset.frames) - len(frames):
         warnings.append(f"{left} of {len(dataset.frames)} instants lack a cloud and are left out")
-    names, path = (rig.lidar, *rig.other_lidars), _pose_file(dataset)
+    names, files = (rig.lidar, *rig.other_lidars), product(dataset.folders, POSE_FILES)
+    path = next((each for pair in files if (each := Path(*pair)).is_file()), None)
     progress("reading clouds of LiDARs", 0, 1)
     drive = Drive(frames, path)
     every = spread_out(range(len(frames)), MOST_INSTANTS)
@@ -121,19 +123,16 @@ def calibrate_rig_lidars(
         except CalibrationError:
             if len(known) < len(far):
                 raise
-            placed, line = _placed(known, place), lost
-            if missing := known.keys() - placed.keys():
-                start, line = (
-                    {**start, **{n: known[n] for n in missing}},
-                    f"{lost}; begun from the guess",
-                )
+            placed = _placed(known, place)
+            missing = {name: T for name, T in known.items() if name not in placed}
+            start, line = start | missing, f"{lost}; begun from the guess" if missing else lost
         warnings.append(line)
     progress("calibrating LiDARs", 0, 1)
     if start:
-        found = _solve(instants, views, start, base=rig.lidar)
-        loose = [name for name in start if _loose(found.covariance[name], rig.lidar)]
-        placed |= _placed([name for name in loose if guess[name] is not None], place)
-        parts.append(found.without(placed))
+        parts.append(_solve(instants, views, start, base=rig.lidar))
+        bars = parts[-1].covariance
+        loose = [n for n in start if guess[n] is not None and _loose(bars[n], rig.lidar)]
+        placed |= _placed(loose, place)
     if placed:
         parts += placed.values()
         seen = f"placed by cameras that see what it and {rig.lidar} see"
@@ -143,7 +142,7 @@ def calibrate_rig_lidars(
     vehicle = None
     if rig.vehicle is not None:
         progress("finding the vehicle's frame", 0, 1)
-        travel = None if path is None else direction_of_travel(read_poses(path)[0])
+        travel = Travel() if path is None else direction_of_travel(read_poses(path)[0])
         vehicle, unknown = find_vehicle(rig.vehicle, _road(clouds, poses), travel)
         warnings += unknown
     for line in warnings:
@@ -235,19 +234,19 @@ def _turn_by_motion(
 
     None where the LiDAR's own motion is unknown.
     """
-    own, moving = drive.of(lidar), [each for each in instants if each.twist_per_s is not None]
-    found = [(each.twist_per_s[3:], own.twist(each.frame)[3:]) for each in moving
-             if each.twist_per_s is not None]  # fmt: skip
-    velocities = [(v, w) for v, w in found if np.any(w)]
-    if not velocities:
+    own, moves = drive.of(lidar), [(i.frame, i.twist_per_s[3:]) for i in instants
+                                   if i.twist_per_s is not None]  # fmt: skip
+    both = np.array([(v, own.twist(frame)[3:]) for frame, v in moves]).reshape(-1, 2, 3)
+    both = both[both[:, 1].any(axis=1)]
+    if not len(both):
         return None
-    ups = [find_upright(name, clouds)[2, :3] for name, clouds in (
-        ("base", [view.points_m for view in maps]), (lidar, [of.clouds[lidar] for of in instants])
-    )]  # fmt: skip
-    speed_m_s = max(float(np.linalg.norm(v)) for v, _ in velocities)
-    pairs = [*velocities, *[(speed_m_s * ups[0], speed_m_s * ups[1])] * len(velocities)]
-    rotation, _ = Rotation.align_vectors(*map(np.array, zip(*pairs, strict=True)))
-    return transform(rotation.as_matrix())
+    ups = [
+        find_upright("base", [view.points_m for view in maps])[2, :3],
+        find_upright(lidar, [of.clouds[lidar] for of in instants])[2, :3],
+    ]
+    speed_m_s = np.linalg.norm(both[:, 0], axis=1).max()
+    pairs = np.concatenate([both, np.tile(speed_m_s * np.array(ups), (len(both), 1, 1))])
+    return transform(Rotation.align_vectors(pairs[:, 0], pairs[:, 1])[0].as_matrix())
 
 
 def _road(clouds: Mapping[str, Sequence[Array]], poses: LidarPoses) -> Road | None:
@@ -263,12 +262,6 @@ def _road(clouds: Mapping[str, Sequence[Array]], poses: LidarPoses) -> Road | No
         return find_road(joined)
     except CalibrationError:  # the axes are named as unknown
         return None
-
-
-def _pose_file(dataset: Dataset) -> Path | None:
-    """Of the poses beside the data; None without any."""
-    paths = (folder / name for folder in dataset.folders for name in POSE_FILES)
-    return next((path for path in paths if path.is_file()), None)
 
 
 def _usable(instants: Sequence[Instant]) -> tuple[list[Instant], list[str]]:

@@ -20,7 +20,7 @@ from calibgraph.errors import CalibrationError
 from calibgraph.matching.cloud_similarity import find_upright, image_from_above
 from calibgraph.model.geometry import angle_deg, invert, move_points, transform
 from calibgraph.vehicle.lidars import count_matched, refine_poses
-from calibgraph.vehicle.planes import Planes, View, Views, moved, thinned
+from calibgraph.vehicle.planes import View, Views, thinned
 
 _GRID = _CELLS, _CELL_M = 192, 0.5  # of an image from above
 _FROM_M, _TO_M = 0.4, 6.0  # over the ground: what is upright
@@ -41,14 +41,6 @@ _AS_GOOD = 0.85  # of the best score
 _OTHER_DEG, _OTHER_M = 5.0, 0.5  # from which a placement is another one
 
 
-class _Seen(NamedTuple):
-    """What a LiDAR sees at some instants: clouds (n, 3), planes; and (4, 4) T_up_lidar."""
-
-    clouds: Sequence[Array]
-    planes: Sequence[Planes]
-    T_up_lidar: Array
-
-
 class _Placement(NamedTuple):
     """Upright planes that lie on others', their share of those near one, (4, 4) T_base_lidar."""
 
@@ -63,10 +55,6 @@ class _Placement(NamedTuple):
     @property
     def score(self) -> float:
         return self.on * self.share**_POWER
-
-
-_Placed = Mapping[str, tuple[_Seen, Array]]
-"""LiDARs whose (4, 4) T_base_lidar is known."""
 
 
 def locate_lidars(
@@ -90,20 +78,27 @@ def locate_lidars(
         CalibrationError: if a LiDAR sees no ground.
     """
     chosen = np.unique(np.linspace(0, len(views[base]) - 1, _INSTANTS).round().astype(int))
-    seen = {name: _look(name, [of[i] for i in chosen]) for name, of in views.items()}
-    placed, left = {base: (seen[base], np.eye(4))}, [name for name in views if name != base]
+    seen = {
+        name: [View(of[i].points_m, thinned(of[i].planes, _MOST_PLANES)) for i in chosen]
+        for name, of in views.items()
+    }
+    T_up = {name: find_upright(name, [view.points_m for view in of]) for name, of in seen.items()}
+    known, left, poses = seen[base], [name for name in views if name != base], dict[str, Array]()
     doubts, lost = dict[str, str](), ""
     while left and not lost:
         found = {}
         for name in left:
             place = None if name in turned else guess[name]
-            up = seen[base].T_up_lidar
-            tried = _placements(seen[name], placed, up, turn=guess[name], guess=place)
+            tried = _placements(
+                seen[name], known, T_up[name], T_up[base], turn=guess[name], guess=place
+            )
             found[name], doubts[name] = _best(tried, place)
-        lost = _why_lost(found, [*placed])
-        placed |= {name: (seen[name], of.T) for name, of in found.items() if of.is_sure}
-        left = [name for name in left if name not in placed]
-    poses = {name: T for name, (_, T) in placed.items() if name != base}
+        lost = _why_lost(found, [base, *poses])
+        for name, of in found.items():
+            if of.is_sure:
+                poses[name] = of.T
+                known = [a.joined(b, of.T) for a, b in zip(known, seen[name], strict=True)]
+        left = [name for name in left if name not in poses]
     return poses, {name: doubts[name] for name in poses if doubts[name]}, lost
 
 
@@ -120,24 +115,20 @@ def _why_lost(found: Mapping[str, _Placement], placed: Sequence[str]) -> str:
     )
 
 
-def _look(name: str, views: Sequence[View]) -> _Seen:
-    points = [view.points_m for view in views]
-    some = [thinned(view.planes, _MOST_PLANES) for view in views]
-    return _Seen(points, some, find_upright(name, points))
-
-
 def _placements(
-    own: _Seen, placed: _Placed, T_up_base: Array, *, turn: Array | None, guess: Array | None
-) -> list[_Placement]:
+    own: Sequence[View], known: Sequence[View], T_up_own: Array, T_up_base: Array, *,
+    turn: Array | None, guess: Array | None,
+) -> list[_Placement]:  # fmt: skip
     """Refined placements that differ: of the guess, and of peaks of the images from above.
 
-    Near the rotation of one (4, 4), and the position of another, if there are any.
+    Against what is known in the frame of the base; near the rotation of one (4, 4), and the
+    position of another, if there are any.
     """
-    headings, offsets, score = _correlate(own, placed, T_up_base)
+    headings, offsets, score = _correlate(own, known, T_up_own, T_up_base)
 
     def away(T_base_lidar: Array) -> tuple[Array, Array]:
         """(h,) [deg], (c, c) [m] from the heading and the position of a placement."""
-        T = T_up_base @ T_base_lidar @ invert(own.T_up_lidar)
+        T = T_up_base @ T_base_lidar @ invert(T_up_own)
         turned = headings - np.degrees(np.arctan2(T[1, 0], T[0, 0]))
         at = np.linalg.norm(offsets - T[:2, 3], axis=-1)
         return np.abs((turned + 180.0) % 360.0 - 180.0), at
@@ -146,23 +137,21 @@ def _placements(
         score[away(turn)[0] > _NEAR_DEG] = -np.inf
     if guess is not None:
         score[:, away(guess)[1] > _NEAR_M] = -np.inf
-    known = [
-        np.concatenate([moved(of.planes[i], T) for of, T in placed.values()])
-        for i in range(len(own.planes))
-    ]
     found, similar = list[_Placement](), np.zeros(len(headings))
     slides = turn is not None and guess is None
     for number in range(_TRIED_ALONG if slides else _TRIED):
         heading, i, j = np.unravel_index(int(score.argmax()), score.shape)
         T = _turn(headings[heading])
         T[:2, 3] = offsets[i, j]
-        start = invert(T_up_base) @ T @ own.T_up_lidar
+        start = invert(T_up_base) @ T @ T_up_own
         if guess is not None and number == 0:
             start = guess
         elif np.isinf(score[heading, i, j]):
             break
-        refined = _refined(known, own.planes, start, T_up_base[2, :3])
-        found += [each for each in refined if guess is None or _is_near(each.T, guess)]
+        refined = _refined(known, own, start, T_up_base[2, :3])
+        found += [
+            each for each in refined if guess is None or _is_near(each.T, guess, _NEAR_DEG, _NEAR_M)
+        ]
         for T in (start, *(each.T for each in refined)):
             angles, shifted = away(T)
             score[(angles <= _PEAK_DEG)[:, None, None] & (shifted <= _PEAK_M)] = -np.inf
@@ -172,20 +161,20 @@ def _placements(
     return found
 
 
-def _correlate(own: _Seen, placed: _Placed, T_up_base: Array) -> tuple[Array, Array, Array]:
+def _correlate(
+    own: Sequence[View], known: Sequence[View], T_up_own: Array, T_up_base: Array
+) -> tuple[Array, Array, Array]:
     """(h,) headings [deg], (c, c, 2) positions of the LiDAR [m], (h, c, c) how well they fit."""
-    known, upright = [], []
-    for instant, cloud in enumerate(own.clouds):
-        clouds = [move_points(of.clouds[instant], T_up_base @ T) for of, T in placed.values()]
-        known.append(
-            np.fft.rfft2(image_from_above(_upright_points(np.concatenate(clouds)), *_GRID))
-        )
-        upright.append(_upright_points(move_points(cloud, own.T_up_lidar)))
+    upright, others = (
+        [_upright_points(move_points(view.points_m, T_up)) for view in of]
+        for of, T_up in ((own, T_up_own), (known, T_up_base))
+    )
+    spectra = [np.fft.rfft2(image_from_above(points, *_GRID)) for points in others]
     maps, headings = [], np.arange(0.0, 360.0, _STEP_DEG)
     for heading in headings:
         products = [
             one * np.fft.rfft2(image_from_above(move_points(two, _turn(heading)), *_GRID)).conj()
-            for one, two in zip(known, upright, strict=True)
+            for one, two in zip(spectra, upright, strict=True)
         ]
         maps.append(np.fft.irfft2(np.sum(products, axis=0)))
     score = np.fft.fftshift(np.array(maps), axes=(1, 2))
@@ -208,16 +197,15 @@ def _upright_points(points_up_m: Array) -> Array:
 
 
 def _refined(
-    known: Sequence[Planes], own: Sequence[Planes], start: Array, up: Array
+    known: Sequence[View], own: Sequence[View], start: Array, up: Array
 ) -> list[_Placement]:
     """Where a start ends, and how its upright planes agree there; ``up`` in the base frame."""
+    planes, both = [[view.planes for view in of] for of in (known, own)], [np.eye(4), start]
     try:
-        T, _ = refine_poses(
-            [known, own], np.array([np.eye(4), start]), ("base", ""), rounds=_ROUNDS
-        )
+        T, _ = refine_poses(planes, np.array(both), ("base", ""), rounds=_ROUNDS)
     except CalibrationError:  # hardly anything in common there
         return []
-    near, on = (float(count[1]) for count in count_matched([known, own], T, up=up))
+    near, on = (float(count[1]) for count in count_matched(planes, T, up=up))
     return [_Placement(int(on), on / max(near, 1.0), T[1])]
 
 
@@ -228,9 +216,11 @@ def _best(tried: Sequence[_Placement], guess: Array | None) -> tuple[_Placement,
     """
     best = max(tried, key=lambda each: each.score, default=_Placement(0, 0.0, np.eye(4)))
     as_good = [each for each in tried if each.score >= _AS_GOOD * best.score]
-    if guess is not None and any(_is_other(each.T, best.T) for each in as_good):
+    if guess is not None and any(
+        not _is_near(each.T, best.T, _OTHER_DEG, _OTHER_M) for each in as_good
+    ):
         best = min(as_good, key=lambda each: np.linalg.norm(each.T[:3, 3] - guess[:3, 3]))
-    others = [each for each in as_good if _is_other(each.T, best.T)]
+    others = [each for each in as_good if not _is_near(each.T, best.T, _OTHER_DEG, _OTHER_M)]
     if not others:
         return best, ""
     degrees, metres = max(_apart(each.T, best.T) for each in others)
@@ -243,11 +233,5 @@ def _apart(T_base_lidar: Array, other: Array) -> tuple[float, float]:
     return degrees, float(np.linalg.norm(T_base_lidar[:3, 3] - other[:3, 3]))
 
 
-def _is_other(T_base_lidar: Array, other: Array) -> bool:
-    degrees, metres = _apart(T_base_lidar, other)
-    return degrees > _OTHER_DEG or metres > _OTHER_M
-
-
-def _is_near(T_base_lidar: Array, guess: Array) -> bool:
-    degrees, metres = _apart(T_base_lidar, guess)
-    return degrees <= _NEAR_DEG and metres <= _NEAR_M
+def _is_near(T_base_lidar: Array, other: Array, deg: float, metres: float) -> bool:
+    return bool((np.array(_apart(T_base_lidar, other)) <= (deg, metres)).all())

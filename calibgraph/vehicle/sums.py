@@ -22,6 +22,7 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
+from calibgraph.model.geometry import adjoints
 from calibgraph.vehicle.planes import PLANE
 
 CELL_M = 4.0
@@ -70,8 +71,8 @@ class Sums:
 
 def sum_up(matches: Matches, T_base_lidar: Array, scale_m: float) -> Sums:
     """The sums with the weights of a Cauchy loss of a width [m], at poses (k, 4, 4)."""
-    steps, rows = _twists_by_steps(T_base_lidar), []
-    metric = np.zeros((6 * len(T_base_lidar), 6 * len(T_base_lidar)))
+    twists, rows = step_twists(T_base_lidar), []
+    steps, metric = twists.reshape(-1, 6, len(twists)), np.zeros_like(twists)
     both = np.sort(np.column_stack([matches["one"], matches["other"]]), axis=1)
     pairs = np.column_stack([matches["place"], both])
     for pair in np.unique(pairs, axis=0):
@@ -90,17 +91,14 @@ def sum_up(matches: Matches, T_base_lidar: Array, scale_m: float) -> Sums:
     return Sums(hessian[:, free, free], gradient[:, free], metric[free, free])
 
 
-def _twists_by_steps(T_base_lidar: Array) -> Array:
-    """(k, 6, 6 k) twist of each LiDAR about the base's origin, by the steps of all.
+def step_twists(T_base_lidar: Array) -> Array:
+    """(6 k, 6 k) twists of (k, 4, 4) LiDARs about the base's origin, by their steps.
 
     A step is a rotation about the LiDAR's own position, and a shift.
     """
-    count = len(T_base_lidar)
-    twists = np.zeros((count, 6, 6 * count))
-    for number, T in enumerate(T_base_lidar):
-        twists[number, :, 6 * number : 6 * number + 6] = np.eye(6)
-        twists[number, 3:, 6 * number : 6 * number + 3] = _cross_matrix(T[None, :3, 3])[0]
-    return twists
+    shifts = np.tile(np.eye(4), (len(T_base_lidar), 1, 1))
+    shifts[:, :3, 3] = T_base_lidar[:, :3, 3]
+    return np.asarray(scipy.linalg.block_diag(*adjoints(shifts)))
 
 
 def _cross_matrix(vectors: Array) -> Array:

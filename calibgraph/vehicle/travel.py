@@ -11,8 +11,8 @@ by l times the turn. How far it is to the side only changes its speed, which pos
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -37,7 +37,7 @@ _MATRIX, _TIME_MATRIX, _TUM = 12, 13, 8  # numbers of a line
 
 @dataclass(frozen=True)
 class Travel:
-    """The direction of travel in the axes of the LiDAR.
+    """The direction of travel in the axes of the LiDAR; by default, nothing is known of it.
 
     Attributes:
         yaw_rad: from the x axis to the left.
@@ -48,12 +48,19 @@ class Travel:
         ahead_sigma_m: standard deviation; infinite if the drive cannot tell.
     """
 
-    yaw_rad: float
-    pitch_rad: float
-    yaw_sigma_rad: float
-    pitch_sigma_rad: float
+    yaw_rad: float = 0.0
+    pitch_rad: float = 0.0
+    yaw_sigma_rad: float = np.inf
+    pitch_sigma_rad: float = np.inf
     ahead_m: float = 0.0
     ahead_sigma_m: float = np.inf
+
+    @property
+    def direction(self) -> Array:
+        """(3,) unit vector."""
+        level = np.cos(self.pitch_rad)
+        turned = np.cos(self.yaw_rad) * level, np.sin(self.yaw_rad) * level
+        return np.array([*turned, -np.sin(self.pitch_rad)])
 
 
 def read_poses(path: Path | str) -> tuple[Array, Array | None]:
@@ -65,37 +72,34 @@ def read_poses(path: Path | str) -> tuple[Array, Array | None]:
     Raises:
         FileError: if a line is none of these or unlike the first, or there are fewer than two.
     """
-    path = Path(path)
-    lines = [line.strip() for line in read_text(path).splitlines()]
-    rows = [
-        (number, line.replace(",", " ").split())
-        for number, line in enumerate(lines, 1)
-        if line and not line.startswith("#")
-    ]
-    if len(rows) < 2:  # noqa: PLR2004
-        raise FileError(path, f"holds {len(rows)} poses, at least 2 are needed")
-    for number, words in rows:
-        if len(words) != len(rows[0][1]):
-            raise FileError(path, f"line {number} has {len(words)} numbers, the first has others")
-    poses, times = zip(*(_pose(words, path, number) for number, words in rows), strict=True)
-    return np.array(poses), None if times[0] is None else np.array(times)
+    path, rows, poses = Path(path), list[list[str]](), list[Array]()
+    for number, line in enumerate(read_text(path).splitlines(), 1):
+        words = line.replace(",", " ").split()
+        if words and not words[0].startswith("#"):
+            rows.append(words)
+            try:
+                poses.append(_pose(words, rows[0]))
+            except ValueError as error:
+                raise FileError(path, f"line {number}: {error}") from error
+    if len(poses) < 2:  # noqa: PLR2004
+        raise FileError(path, f"holds {len(poses)} poses, at least 2 are needed")
+    has_times = len(rows[0]) != _MATRIX
+    return np.array(poses), np.array([row[0] for row in rows], float) if has_times else None
 
 
-def _pose(words: list[str], path: Path, number: int) -> tuple[Array, float | None]:
-    try:
-        values = np.array(words, dtype=np.float64)
-        time_s = None if len(values) == _MATRIX else float(values[0])
-        if len(values) == _TUM:
-            return pose_of_quaternion(values[1:4].tolist(), values[4:].tolist()), time_s
-        if len(values) in (_MATRIX, _TIME_MATRIX):
-            T = rigid_transform([*values[-_MATRIX:].reshape(3, 4).tolist(), [0, 0, 0, 1]])
-            return T, time_s
-    except ValueError as error:
-        raise FileError(path, f"line {number}: {error}") from error
-    raise FileError(
-        path, f"line {number} has {len(words)} numbers; expected 12 of a matrix (KITTI), time and "
-        "these 12, or time x y z qx qy qz qw (TUM)"
-    )  # fmt: skip
+def _pose(words: Sequence[str], first: Sequence[str]) -> Array:
+    """(4, 4) of a line that is like the first."""
+    if len(words) != len(first):
+        raise ValueError(f"{len(words)} numbers, the first line has {len(first)}")
+    values = np.array(words, dtype=np.float64)
+    if len(values) == _TUM:
+        return pose_of_quaternion(values[1:4].tolist(), values[4:].tolist())
+    if len(values) in (_MATRIX, _TIME_MATRIX):
+        return rigid_transform([*values[-_MATRIX:].reshape(3, 4).tolist(), [0, 0, 0, 1]])
+    raise ValueError(
+        f"{len(words)} numbers; expected 12 of a matrix (KITTI), time and these 12, or time "
+        "x y z qx qy qz qw (TUM)"
+    )
 
 
 def direction_of_travel(T_world_lidar: Array) -> Travel:
@@ -111,15 +115,14 @@ def direction_of_travel(T_world_lidar: Array) -> Travel:
         np.arctan2(chords[:, 1], chords[:, 0]), np.arctan2(-chords[:, 2], level)
     ])  # fmt: skip
     if len(found) < 2 * _LEAST_PARTS:
-        return Travel(0.0, 0.0, np.inf, np.inf)
+        return Travel()
     parts = np.array_split(found, min(_PARTS, len(found) // 2))
     means = np.array([part.mean(axis=0) for part in parts])
     middle = np.median(found, axis=0)
     sigmas = means.std(axis=0, ddof=1) / np.sqrt(len(means))
-    yaw, pitch, yaw_sigma, pitch_sigma = map(float, (*middle, *sigmas))
-    ahead = np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), -np.sin(pitch)])
-    lever = _lever(every, ahead)
-    return Travel(yaw, pitch, yaw_sigma, pitch_sigma, *lever)
+    travel = Travel(*map(float, (*middle, *sigmas)))
+    ahead_m, ahead_sigma_m = _lever(every, travel.direction)
+    return replace(travel, ahead_m=ahead_m, ahead_sigma_m=ahead_sigma_m)
 
 
 def _lever(stretches: Array, ahead: Array) -> tuple[float, float]:

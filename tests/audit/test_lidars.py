@@ -16,10 +16,11 @@ from calibgraph.audit.lidars import measure_lidars
 from calibgraph.errors import CalibrationError, RigError
 from calibgraph.model.calibration import Calibration
 from calibgraph.model.config import Config
-from calibgraph.model.geometry import invert, transform
+from calibgraph.model.geometry import invert, transform, twist_between
 from calibgraph.model.rig import Lidar, Rig
 from calibgraph.model.verdict import TOLERANCE
 from calibgraph.progress import no_progress
+from calibgraph.vehicle.joined import joint_covariance
 from calibgraph.vehicle.lidars import LidarPoses
 from calibgraph.vehicle.rig import judge_lidar
 from tests.conftest import Call
@@ -63,8 +64,8 @@ def measured(monkeypatch, poses: LidarPoses, deployed: Rig, tolerance: Array):
     """The audits of a recording that gives these poses."""
     verdicts = {name: judge_lidar(poses, name, TOLERANCE) for name in poses.covariance}
     found = SimpleNamespace(poses=poses, verdicts=verdicts)
-    monkeypatch.setattr(audit_of_lidars, "calibrate_rig_lidars", lambda *_, **__: found)
-    return measure_lidars(deployed, None, Config(), tolerance, sensors=2, progress=no_progress)[0]
+    monkeypatch.setattr(audit_of_lidars, "find_lidars", lambda *_, **__: (None, found, ""))
+    return measure_lidars(deployed, None, Config(), tolerance, progress=no_progress)[1]
 
 
 @pytest.mark.parametrize("moved", ["", "front", "left"])
@@ -85,13 +86,35 @@ def test_lidars_that_overlap_too_little_cannot_be_told_and_unknown_ones_are_refu
     def fail(*_: object, **__: object) -> None:
         raise CalibrationError("LiDAR 'left' sees 3 planes")
 
-    monkeypatch.setattr(audit_of_lidars, "calibrate_rig_lidars", fail)
-    found, _ = measure_lidars(deployed, None, Config(), tolerance, sensors=2, progress=no_progress)
+    monkeypatch.setattr(audit_of_lidars, "find_lidars", fail)
+    _, found = measure_lidars(deployed, None, Config(), tolerance, progress=no_progress)
     assert {of.status for of in found.audits.values()} == {"CANNOT TELL"}
     assert "sees 3 planes" in found.audits["left"].reason
     unknown = deployed.model_copy(update={"lidars": {**deployed.lidars, "left": Lidar()}})
     with pytest.raises(RigError, match=r"lidars.left: has no T_base_lidar"):
-        measure_lidars(unknown, None, Config(), tolerance, sensors=2, progress=no_progress)
+        measure_lidars(unknown, None, Config(), tolerance, progress=no_progress)
+
+
+def test_deviations_of_cameras_and_lidars_have_one_covariance(monkeypatch):
+    poses, by_lidars = poses_of(1), 1e-3 * np.random.default_rng(2).normal(size=(18, 12))
+    lidars = {name: Lidar(T_base_lidar=T) for name, T in poses.T_base_lidar.items()}
+    deployed = Rig(lidar="top", lidars={**lidars, "top": Lidar()})
+    found = measured(monkeypatch, poses, deployed, np.array([0.01, 0.1]))
+    columns = []  # deviations of what is deployed rightly, by one error of the poses each
+    for column, root in zip(by_lidars.T, poses.root.T, strict=True):
+        own = []
+        for name, error in zip(poses.covariance, root.reshape(-1, 6), strict=True):
+            T = poses.T_base_lidar[name]
+            turned = Rotation.from_rotvec(error[:3]).as_matrix() @ T[:3, :3]
+            truth = transform(turned, T[:3, 3] + error[3:])
+            own.append(twist_between(invert(truth), invert(T)))
+        columns.append(np.concatenate([column, *own]))  # T_camera_lidar = exp(xi) estimate
+    of_cameras = by_lidars @ by_lidars.T
+    joint = joint_covariance(of_cameras, -by_lidars, found.covariance, found.by_errors)
+    expected = np.transpose(columns) @ columns
+    sigmas = np.sqrt(np.diag(expected))
+    # of turns of 0.02 deg, second orders are 3e-4
+    assert np.abs((joint - expected) / np.outer(sigmas, sigmas)).max() < 1e-3
 
 
 @pytest.mark.parametrize("moved", ["", "front", "top"])

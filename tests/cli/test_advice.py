@@ -147,10 +147,10 @@ def _begins(monkeypatch: pytest.MonkeyPatch) -> None:
     def begin(*given: Any, **options: Any) -> None:
         raise CalibrationError("begun")
 
-    for work in ("pipeline.calibrate", "rounds.match_in_rounds", "pick.server.PickServer"):
+    for work in ("calibrate", "rounds.match_in_rounds", "pick.server.PickServer"):
         monkeypatch.setattr(f"calibgraph.{work}", begin)
     monkeypatch.setattr(import_module("calibgraph.audit.check"), "match_from_deployed", begin)
-    monkeypatch.setattr("calibgraph.doctor.diagnose", lambda *_, **__: Diagnosis(()))
+    monkeypatch.setattr("calibgraph.diagnose", lambda *_, **__: Diagnosis(()))
 
 
 @pytest.mark.parametrize("line", [line for line in LINES if not line.startswith("#")])

@@ -27,7 +27,7 @@ def test_ctrl_c_is_one_line(monkeypatch: pytest.MonkeyPatch, call: Call) -> None
     def interrupt(*arguments: object, **options: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("calibgraph.io.rigs.load_rig", interrupt)
+    monkeypatch.setattr("calibgraph.load_rig", interrupt)
     code, out, err = call("perturb", SAMPLE, "--out", "never.yaml")
     assert (code, out, err) == (130, "", "calibgraph: interrupted\n")
 
@@ -49,7 +49,7 @@ def test_a_crash_is_one_line_and_no_fail(
     def fail(*_: object, **__: object) -> None:
         raise error
 
-    monkeypatch.setattr("calibgraph.io.rigs.load_rig", fail)
+    monkeypatch.setattr("calibgraph.load_rig", fail)
     code, out, err = call("evaluate", SAMPLE, SAMPLE)
     assert (code, out) == (2, "")
     assert message in err and err.count("\n") == 1

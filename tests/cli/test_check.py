@@ -33,7 +33,7 @@ def measured_once(monkeypatch: pytest.MonkeyPatch) -> None:
         same_recording, verdict = provenance(rig, data)
         return replace(MEASURED[0], same_recording=same_recording, deployed_verdict=verdict)
 
-    monkeypatch.setattr("calibgraph.audit.check", measure)
+    monkeypatch.setattr("calibgraph.check", measure)
 
 
 def test_a_right_rig_exits_with_0_and_the_json_names_its_units(call: Call) -> None:

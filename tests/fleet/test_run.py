@@ -21,7 +21,7 @@ from calibgraph import load_correspondences, load_rig, solve
 from calibgraph.child_process import Outcome
 from calibgraph.errors import CalibrationError, FileError
 from calibgraph.fleet.files import Store, read_rows
-from calibgraph.fleet.job import Limits, release, run_job
+from calibgraph.fleet.job import RELEASE, Limits, run_job
 from calibgraph.fleet.manifest import Job, load_manifest
 from calibgraph.fleet.run import Summary, dask_executor, run_fleet, thread_executor
 from tests.draws.fleets import run_here, write_fleet
@@ -169,9 +169,9 @@ def test_rows_and_workers_of_another_version_are_refused(
     folder: Path, alone: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     manifest = str(folder / "fleet.csv")
-    with pytest.raises(CalibrationError, match=f"a worker has calibgraph {release()}, the command"):
+    with pytest.raises(CalibrationError, match=f"a worker has calibgraph {RELEASE}, the command"):
         run_job(load_manifest(manifest)[0][0], Limits(), "9.9")
-    monkeypatch.setattr("calibgraph.fleet.run.release", lambda: "9.9")
+    monkeypatch.setattr("calibgraph.fleet.run.RELEASE", "9.9")
     with pytest.raises(FileError, match=r"holds rows of calibgraph .*, this is 9.9; choose"):
         run_fleet(manifest, str(folder / "alone"))
 

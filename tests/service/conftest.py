@@ -76,4 +76,4 @@ def bearer(token: str) -> dict[str, str]:
 def service_folder(client: TestClient) -> Path:
     """The data folder of a server in this process."""
     app: Any = client.app
-    return Path(app.state.service.folder.path)
+    return Path(app.state.service.path)

@@ -9,8 +9,8 @@ import pytest
 from starlette.testclient import TestClient
 
 from calibgraph.errors import CalibrationError
+from calibgraph.service import state
 from calibgraph.service.app import create_app
-from calibgraph.service.folders import DataFolder
 from calibgraph.service.jobs import DATABASE
 from calibgraph.service.requests import Settings
 from tests.service.conftest import URL, Make, Problem, service_folder
@@ -26,7 +26,7 @@ def test_a_full_disk_acknowledges_nothing(
         raise OSError(number, "no space left")
 
     with monkeypatch.context() as patch:
-        patch.setattr(DataFolder, "keep", full)
+        patch.setattr(state, "sync_to_disk", full)
         answer = client.post("/v1/jobs/solve", files=small.files)
     assert answer.status_code == 507
     assert client.get("/v1/jobs").json()["jobs"] == []

@@ -60,7 +60,7 @@ def what_is_wrong(client: Any, upload: Hostile, small: Problem, monkeypatch: Any
 
 def run(client: Any, id: str, monkeypatch: Any) -> Outcome:
     """Run a job as its process does, with its limit of memory."""
-    task = client.app.state.service.runner.task(client.app.state.service.jobs.get(id))
+    task = client.app.state.service.task(client.app.state.service.jobs.get(id))
     monkeypatch.chdir(os.getcwd())  # it goes back there
     held = psutil.Process().memory_info().data
     with memory_limit(held + MEMORY_BYTES):

@@ -8,7 +8,7 @@ from calibgraph.errors import FileError
 from calibgraph.model.geometry import transform
 from calibgraph.model.rig import Vehicle
 from calibgraph.vehicle.frame import Road, find_road, find_vehicle
-from calibgraph.vehicle.travel import direction_of_travel, read_poses
+from calibgraph.vehicle.travel import Travel, direction_of_travel, read_poses
 from tests.vehicle.scenes import HEIGHT_M, draw_place, scan
 
 R_VEHICLE_LIDAR = Rotation.from_euler("zyx", [-1.3, 2.0, 1.0], degrees=True)
@@ -89,7 +89,7 @@ def test_what_is_typed_is_one_more_measurement():
     stated = Vehicle(
         T_vehicle_lidar=typed, rotation_sigma_rad=0.01, translation_sigma_m=(0.02, 0.02, np.inf)
     )
-    vehicle, notes = find_vehicle(stated, road_of(Rotation.identity()), None)
+    vehicle, notes = find_vehicle(stated, road_of(Rotation.identity()), Travel())
     assert not notes
     np.testing.assert_allclose(vehicle.T_vehicle_lidar[:2, 3], [1.2, 0.0], atol=1e-9)
     assert abs(vehicle.T_vehicle_lidar[2, 3] - HEIGHT_M) < 0.01, "1.9 m had no weight"
@@ -116,11 +116,11 @@ def test_poses_are_read_as_matrices_and_as_tum(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("1 2 3\n" * 2, "line 1 has 3 numbers; expected 12 of a matrix"),
+        ("1 2 3\n" * 2, "line 1: 3 numbers; expected 12 of a matrix"),
         ("0 0 0 0 0 0 0 2\n" * 2, "line 1: quaternion .* has length 2"),
         ("# t\n" + "1 0 0 0 0 2 0 0 0 0 1 0\n" * 2, "line 2: the upper left 3x3 is not a rotation"),
         ("1 0 0 0 0 1 0 0 0 0 1 0\n", "holds 1 poses"),
-        ("0 0 0 0 0 0 0 1\n1 0 0 0 0 1 0 0 0 0 1 0\n", "line 2 has 12 numbers, the first has"),
+        ("0 0 0 0 0 0 0 1\n1 0 0 0 0 1 0 0 0 0 1 0\n", "line 2: 12 numbers, the first line has 8"),
         ("0 a 0 0 0 0 0 1\n" * 2, "line 1: could not convert"),
     ],
 )

@@ -1,6 +1,5 @@
 """Cameras with the clouds of several LiDARs, and LiDARs that only cameras join."""
 
-import copy
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
@@ -25,21 +24,20 @@ from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError
 from calibgraph.io.dataset import Dataset
 from calibgraph.io.frame import Frame, ScanMotion, frame_of_entry
+from calibgraph.matching.joined_clouds import errors_by_lidars, with_lidar_errors
 from calibgraph.matching.named import find_matcher
-from calibgraph.matching.protocol import FullMatcher
 from calibgraph.model.config import Config
 from calibgraph.model.geometry import invert, move_points, retract_all, transform, twist_between
 from calibgraph.model.rig import Lidar
 from calibgraph.vehicle.joined import (
-    JoinedMatcher,
-    errors_by_lidars,
     join_clouds,
     joint_covariance,
+    lidar_errors,
     place_by_cameras,
 )
 from calibgraph.vehicle.lidars import LidarPoses
 from calibgraph.vehicle.rig import LidarResult
-from tests.conftest import SAMPLE, make_pair
+from tests.conftest import SAMPLE, Call, make_pair
 
 T_TOP_LOW = transform(Rotation.from_euler("ZYX", [70, 5, -3], degrees=True), [0.8, -0.4, -0.5])
 SIGMAS = np.repeat([np.radians(0.03), 0.01], 3)
@@ -48,6 +46,10 @@ TOLERANCE = Config().tolerance
 
 def poses_of(T: Array, sigmas: Array = SIGMAS) -> LidarPoses:
     return LidarPoses("top", {"top": np.eye(4), "low": T}, np.diag(sigmas**2), {}, 5, (1.0, 1.0))
+
+
+def with_errors(data: Dataset, sigmas: Array = SIGMAS) -> Dataset:
+    return replace(data, lidar_errors=lidar_errors(poses_of(T_TOP_LOW, sigmas)))
 
 
 def moved(T: Array, error: Array) -> Array:
@@ -94,7 +96,7 @@ def test_where_the_vehicle_moves_only_timed_points_are_joined(tmp_path: Path):
 
 
 @pytest.fixture(scope="module")
-def drawn(tmp_path_factory: pytest.TempPathFactory) -> tuple[Rig, Correspondences, list[Frame]]:
+def drawn(tmp_path_factory: pytest.TempPathFactory) -> tuple[Rig, Correspondences, Dataset]:
     """Matches of two cameras; of the left one half, of the right one all have points of ``low``."""
     folder, rig = tmp_path_factory.mktemp("joined"), make_pair()
     errors = MatcherErrors(noise_px=0.5, outlier_share=0.0)
@@ -112,18 +114,18 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> tuple[Rig, Correspondence
                 number, str(number), base, {}, lidar_paths={"low": path}, joined={"low": T_TOP_LOW}
             )
         )
-    return rig, table, frames
+    return rig, table, Dataset(rig, tuple(frames), (folder,))
 
 
 def test_errors_of_cameras_are_those_of_solving_with_a_wrong_lidar(
-    drawn: tuple[Rig, Correspondences, list[Frame]],
+    drawn: tuple[Rig, Correspondences, Dataset],
 ):
-    rig, table, frames = drawn
-    columns = errors_by_lidars(table, frames, rig, poses_of(T_TOP_LOW))
+    rig, table, data = drawn
+    columns = errors_by_lidars(table, with_errors(data), rig)
     rng = np.random.default_rng(4)
     error = 0.1 * SIGMAS * rng.normal(size=6)
     wrong = moved(T_TOP_LOW, -error)  # the error is from the estimate to the truth
-    low = np.array([of.load_in_base("low")[:, :3] for of in frames], dtype=object)
+    low = np.array([of.load_in_base("low")[:, :3] for of in data.frames], dtype=object)
     points = table.points_lidar_m.copy()
     for number, cloud in enumerate(low):
         own = np.flatnonzero(table.frame == number)
@@ -139,28 +141,27 @@ def test_errors_of_cameras_are_those_of_solving_with_a_wrong_lidar(
         assert np.abs(found).max() > 1e-5
 
 
-def test_cameras_and_lidars_have_one_covariance(drawn: tuple[Rig, Correspondences, list[Frame]]):
-    rig, table, frames = drawn
+def test_cameras_and_lidars_have_one_covariance(drawn: tuple[Rig, Correspondences, Dataset]):
+    rig, table, data = drawn
     poses = poses_of(T_TOP_LOW)
-    columns = np.concatenate([*errors_by_lidars(table, frames, rig, poses).values()])
-    joint = joint_covariance(columns @ columns.T + 1e-12 * np.eye(12), columns, poses)
+    of_lidars = poses.joint_covariance, poses.root
+    columns = np.concatenate([*errors_by_lidars(table, with_errors(data), rig).values()])
+    joint = joint_covariance(columns @ columns.T + 1e-12 * np.eye(12), columns, *of_lidars)
     assert joint.shape == (18, 18)
     sigmas = np.sqrt(np.diag(joint))
     assert np.linalg.eigvalsh(joint / np.outer(sigmas, sigmas)).min() > -1e-9
     # With all its points of one LiDAR, a camera errs by nothing but that LiDAR's pose.
     np.testing.assert_allclose(joint[6:12, 12:] / SIGMAS, columns[6:], rtol=1e-6, atol=1e-12)
-    alone = joint_covariance(np.eye(12), np.zeros((12, 0)), poses)
+    alone = joint_covariance(np.eye(12), np.zeros((12, 0)), *of_lidars)
     np.testing.assert_array_equal(alone[:12, 12:], 0.0)
 
 
 def test_solved_tables_keep_what_lidars_add(
-    drawn: tuple[Rig, Correspondences, list[Frame]], tmp_path: Path
+    drawn: tuple[Rig, Correspondences, Dataset], tmp_path: Path
 ):
-    rig, table, frames = drawn
-    large = poses_of(T_TOP_LOW, 3 * SIGMAS)
-    columns = errors_by_lidars(table, frames, rig, large)
-    content = {name: of.tolist() for name, of in columns.items()}
-    known = table.with_findings(replace(table.findings, by_lidars=content))
+    rig, table, data = drawn
+    data = with_errors(data, 3 * SIGMAS)
+    columns, known = errors_by_lidars(table, data, rig), with_lidar_errors(table, data, rig)
     path = tmp_path / "table.parquet"
     known.save(path)
     plain, wider = calibgraph.solve(rig, table), calibgraph.solve(rig, path)
@@ -255,7 +256,7 @@ def split_sample(folder: Path, upto_deg: float, from_deg: float) -> Dataset:
 @pytest.mark.slow
 @pytest.mark.parametrize(("upto_deg", "from_deg"), [(75.0, -15.0), (10.0, 10.0)])
 def test_cameras_that_the_base_does_not_show_are_calibrated_to_all_lidars(
-    upto_deg: float, from_deg: float, tmp_path: Path
+    upto_deg: float, from_deg: float, tmp_path: Path, call: Call
 ):
     result = calibgraph.calibrate(split_sample(tmp_path, upto_deg, from_deg))
     truth = load_rig(SAMPLE / "reference.yaml")
@@ -275,27 +276,23 @@ def test_cameras_that_the_base_does_not_show_are_calibrated_to_all_lidars(
     path = result.save(tmp_path / "out")
     again = calibgraph.load_calibration(path)
     assert frame_of_entry(again.frames[0]).joined.keys() == {"low"}
-    if from_deg < upto_deg:  # else planes do not measure the LiDAR again
-        audit = calibgraph.check(path, tmp_path)
-        assert {n: audit.cameras[n].status for n in audit.cameras} == dict.fromkeys(
-            truth.cameras, "OK"
-        )
+    audit = calibgraph.check(path, tmp_path)
+    assert {of.status for of in audit.cameras.values()} == {"OK"}
+    low = audit.lidars["low"]
+    assert np.abs(low.deviation / low.sigma).max() < 4
+    # placed by one camera its bar is wider than the tolerance
+    assert low.status == ("OK" if from_deg < upto_deg else "CANNOT TELL")
+    if from_deg < upto_deg:
+        code, _, err = call("match", tmp_path, "--out", tmp_path / "table.parquet")
+        table = calibgraph.load_correspondences(tmp_path / "table.parquet")
+        assert code == 0, err
+        assert table.findings.by_lidars.keys() == {*truth.cameras}
+        assert table.counts() == result.correspondences.counts()
 
 
-def test_a_matcher_on_joined_clouds_is_the_matcher_in_all_else():
-    inner = find_matcher("structure")
-    joined = JoinedMatcher(inner, poses_of(T_TOP_LOW))
-    assert FullMatcher(joined).rounds == inner.rounds > 1
-    assert copy.copy(joined).rounds == inner.rounds
-    assert joined.with_estimate(("offset",)) is not joined
-    table = simulate_correspondences(make_pair(), frames=1, matches=10)
-    of_table = JoinedMatcher(find_matcher(table), poses_of(T_TOP_LOW))
-    assert of_table.with_estimate(("offset",)) is of_table
-
-
-@pytest.mark.parametrize("named", [False, True])
+@pytest.mark.parametrize("kind", ["file", "table", "matcher"])
 def test_tables_place_no_lidar_and_join_no_clouds(
-    named: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     """Their points are of one LiDAR: both sides would be the same."""
     data = split_sample(tmp_path, 10.0, 10.0)
@@ -307,7 +304,8 @@ def test_tables_place_no_lidar_and_join_no_clouds(
 
     monkeypatch.setattr("calibgraph.pipeline.calibrate_rig_lidars", found)
     table.save(tmp_path / "table.parquet")
-    result = calibgraph.calibrate(data, matcher=tmp_path / "table.parquet" if named else table)
+    given = {"file": tmp_path / "table.parquet", "table": table, "matcher": find_matcher(table)}
+    result = calibgraph.calibrate(data, matcher=given[kind])
     assert asked == [None]
     assert not any("joined" in line for line in result.warnings)
 

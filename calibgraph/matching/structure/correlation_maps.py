@@ -168,14 +168,14 @@ def _correlate_frame(
     image: _AngularImage, cloud: PreparedCloud, windows: Windows, camera: Camera
 ) -> CorrelationMaps:
     """The maps of the windows of one frame."""
-    if not len(windows.counts):
+    if not len(windows):
         nothing = np.zeros((0, *image.inside.shape), np.float32)
         return CorrelationMaps(nothing, np.zeros((0, 3)), image.origin_rad, float(STEP_RAD))
     R = camera.T_camera_lidar[:3, :3]
-    centres_m = windows.rays_m[:, 0] @ R.T
+    centres_m = windows["rays_m"][:, 0] @ R.T
     order, group, counts = group_windows(centres_m, GROUP_RAD, OCTAVES_PER_BIN)
-    windows, centres = windows.select(order), mean_by_group(centres_m[order], group, counts)
-    turned = windows.rays_m @ R.T
+    windows, centres = windows[order], mean_by_group(centres_m[order], group, counts)
+    turned = windows["rays_m"] @ R.T
     angles = view_angles(turned.reshape(-1, 3)).reshape(*turned.shape[:2], 2)
     off_centre = angles - view_angles(centres)[group][:, None]
     places = np.rint(off_centre / STEP_RAD).astype(np.int32)
@@ -220,10 +220,8 @@ def _score_maps(
     inside = image.inside
     maps = np.zeros((groups, *inside.shape), np.float32)
     first = np.zeros(2, np.int64)
-    score_windows(
-        pad(image.log_gray), places, windows.counts, windows.basis, group, first, False, maps,
-        CHANCE,
-    )  # fmt: skip
+    of_windows = windows["count"], windows["basis"]
+    score_windows(pad(image.log_gray), places, *of_windows, group, first, False, maps, CHANCE)
     maps *= inside
     maps -= (maps.sum(axis=(1, 2)) / inside.sum())[:, None, None]
     counts = np.bincount(group).astype(np.float32)[:, None, None]

@@ -113,7 +113,7 @@ class PreparedCloud:
         """Number of fine windows with structure, of a limited number tried all around."""
         everywhere = np.ones(len(self.points_lidar_m), np.bool_)
         table = self.windows(camera, everywhere, spacing_rad, stride_spacings, fine=True)
-        return len(table.cut(everywhere, everywhere, max_covered=1.0, max_windows=most).rays_m)
+        return len(table.cut(everywhere, everywhere, max_covered=1.0, max_windows=most))
 
 
 def _ranks(values: Array) -> Array:

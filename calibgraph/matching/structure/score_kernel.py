@@ -59,7 +59,7 @@ def score_windows(
     likelihood: bool,
     grids: NDArray[np.float32],
     chance: float = 1.0,
-) -> None:
+) -> NDArray[np.float32]:
     """Add every window's score at all shifts to its group's grid.
 
     The score is d_D^2 + w d_I^2, with d the image's components along the columns of the basis, over
@@ -78,6 +78,9 @@ def score_windows(
         likelihood: of the kind of score.
         grids: (g, s, s).
         chance: how much of an unrelated window's share to subtract.
+
+    Returns:
+        (g, s, s) of likelihoods: how many of the windows are in the image; else (0, s, s).
     """
     height, width = padded.shape[0] - LINES, padded.shape[1] - LANES
     rows, columns = grids.shape[1:]
@@ -85,55 +88,19 @@ def score_windows(
     ones[:LANES] = 1
     totals = _aligned(rows * math.ceil(columns / LANES) * LANES + LANES)
     totals[:] = likelihood
+    inside = np.zeros((len(grids) if likelihood else 0, rows, columns), np.float32)
     room = (
         np.empty(places.shape[1] + POINTS, np.int64),
         _aligned(LINES * SUMS_WITH_TREND * LANES),
         ones,
         totals,
     )
+    windows = places, np.ascontiguousarray(counts), np.ascontiguousarray(basis), group
     _score_windows(
-        padded.ravel(), (height, width), (places, counts, basis, group), origin, likelihood, room,
-        grids, (np.float32(chance * CHANCE_DEPTH), np.float32(chance * CHANCE_INTENSITY)),
+        padded.ravel(), (height, width), windows, origin, likelihood, room,
+        grids, inside, (np.float32(chance * CHANCE_DEPTH), np.float32(chance * CHANCE_INTENSITY)),
     )  # fmt: skip
-
-
-def centre_grids(
-    shape: NDArray[np.int64],
-    places: NDArray[np.int32],
-    counts: NDArray[np.int32],
-    group: NDArray[np.int32],
-    origin: NDArray[np.int64],
-    grids: NDArray[np.float32],
-) -> None:
-    """Subtract the mean score of a window from each grid, as often as windows are in the image.
-
-    A window that leaves the image counts 0, as an unrelated one does in the mean: subtracted from
-    all shifts alike, the mean would hold windows near the border in the image, and with them the
-    ground below the camera, by pitch and height.
-
-    shape: height and width of the image; the others as of :func:`score_windows`.
-    """
-    inside = np.zeros_like(grids)
-    _count_inside(shape, places, counts, group, origin, inside)
-    seen = np.maximum(inside.sum(axis=(1, 2), keepdims=True), 1)
-    grids -= inside * (grids.sum(axis=(1, 2), keepdims=True) / seen)
-
-
-@compiled()
-def _count_inside(shape, places, counts, group, origin, inside):  # type: ignore[no-untyped-def]
-    """Count, at each shift, the windows of each group that are in the image."""
-    height, width, x, y = shape[0], shape[1], origin[0], origin[1]
-    for w in range(len(places)):
-        left, top = places[w, 0, 0], places[w, 0, 1]
-        right, bottom, grid = left, top, inside[group[w]]
-        for p in range(counts[w]):
-            u, v = places[w, p, 0], places[w, p, 1]
-            left, right = u if u < left else left, u if u > right else right
-            top, bottom = v if v < top else top, v if v > bottom else bottom
-        for row in range(grid.shape[0]):
-            if top + y + row >= 0 and bottom + y + row < height:
-                for column in range(grid.shape[1]):
-                    grid[row, column] += (left + x + column >= 0) & (right + x + column < width)
+    return inside
 
 
 def _aligned(size: int) -> NDArray[np.float32]:
@@ -144,7 +111,9 @@ def _aligned(size: int) -> NDArray[np.float32]:
 
 
 @compiled(fastmath=True)
-def _score_windows(pixels, shape, windows, origin, likelihood, room, grids, by_chance):  # type: ignore[no-untyped-def]
+def _score_windows(  # type: ignore[no-untyped-def]  # noqa: PLR0912 - one pass
+    pixels, shape, windows, origin, likelihood, room, grids, counted, by_chance
+):
     """See :func:`score_windows`.
 
     room: for the place in pixels of each point of a window; zeros for the sums of a strip; a vector
@@ -174,6 +143,10 @@ def _score_windows(pixels, shape, windows, origin, likelihood, room, grids, by_c
         size, end = origin[0] + columns, origin[1] + rows
         size = (width - right if width - right < size else size) - first
         end = height - bottom if height - bottom < end else end
+        if likelihood:
+            for row in range(above - origin[1], end - origin[1]):
+                for column in range(first - origin[0], first - origin[0] + size):
+                    counted[group[w], row, column] += 1
         numbers = np.float32(1 / n), np.float32(n * GRAY_NOISE**2), share
         for p in range(n - 1, n + POINTS):
             starts[p] = height * stride  # zeros, which add nothing

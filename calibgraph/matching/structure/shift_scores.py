@@ -15,15 +15,10 @@ from calibgraph.matching.structure.directions import view_angles
 from calibgraph.matching.structure.prepared_cloud import PreparedCloud
 from calibgraph.matching.structure.prepared_image import PreparedImage
 from calibgraph.matching.structure.schedule import Level
-from calibgraph.matching.structure.score_kernel import (
-    LANES,
-    LINES,
-    centre_grids,
-    score_windows,
-)
+from calibgraph.matching.structure.score_kernel import score_windows
 from calibgraph.matching.structure.visibility import find_in_view, find_places, find_visible
 from calibgraph.matching.structure.window_weights import window_network
-from calibgraph.matching.structure.windows import Windows
+from calibgraph.matching.structure.windows import Windows, weigh
 from calibgraph.memory import mmap_zeros
 from calibgraph.model.clock import seen_at_rows, when_taken
 from calibgraph.model.rig import Camera
@@ -91,12 +86,12 @@ def score_frame(  # noqa: PLR0913 - what is scored, and how
     image, scale = gray.padded_log_gray(camera, level.step_rad, level.blur_steps)
     windows = select_windows(cloud, camera, level, max_windows=max_windows)
     T, viewpoint_m = camera.T_camera_lidar, cloud.viewpoint_lidar_m(camera)
-    centres_m = windows.rays_m[:, 0] + viewpoint_m
+    centres_m = windows["rays_m"][:, 0] + viewpoint_m
     kept, group, counts = group_windows(
         centres_m @ T[:3, :3].T + T[:3, 3], level.group_rad, OCTAVES_PER_BIN, MIN_GROUP_WINDOWS
     )
-    windows, centres_m = windows.select(kept), centres_m[kept]
-    rays_m, seen_m = windows.rays_m, centres_m
+    windows, centres_m = windows[kept], centres_m[kept]
+    rays_m, seen_m = windows["rays_m"], centres_m
     if twist_per_s is not None and camera.readout_s:  # where a rolling shutter sees them
         moved_m = seen_at_rows(camera, rays_m + viewpoint_m, twist_per_s)
         rays_m, seen_m = (moved_m - viewpoint_m).astype(np.float32), moved_m[:, 0]
@@ -111,7 +106,7 @@ def score_frame(  # noqa: PLR0913 - what is scored, and how
         points_lidar_m=mean_by_group(centres_m, group, counts),
         pixels_px=pixels_px,
         frame=np.full(len(counts), frame, np.int64),
-        weights=np.bincount(group, windows.weight, minlength=len(counts)).astype(np.float64),
+        weights=np.bincount(group, windows["weight"], minlength=len(counts)).astype(np.float64),
         steps_per_px=scale,
     )
 
@@ -148,7 +143,7 @@ def _select_windows(
     )
     max_covered = 0.0 if level.fine else MAX_COVERED
     windows = table.cut(in_view, clear, max_covered=max_covered, max_windows=max_windows)
-    return windows.weighed(window_network()) if level.weighed else windows
+    return weigh(windows, window_network()) if level.weighed else windows
 
 
 def concatenate_scores(scores: Sequence[ShiftScores]) -> ShiftScores:
@@ -234,10 +229,21 @@ def _add_scores(
     At coarse levels that is of all shifts: poses that take few windows out of the image are better
     ones to propose.
     """
-    at, reach = (places, windows.counts), (grids.shape[1] - 1) // 2
-    origin, shape = np.array([-reach, -reach]), np.subtract(image.shape, (LINES, LANES))
-    score_windows(image, *at, windows.basis, group, origin, likelihood, grids)
+    reach = (grids.shape[1] - 1) // 2
+    at, origin = (places, windows["count"], windows["basis"], group), np.array([-reach, -reach])
+    inside = score_windows(image, *at, origin, likelihood, grids)
     if likelihood:
-        centre_grids(shape, *at, group, origin, grids)
+        subtract_mean_score(grids, inside)
     else:
         grids -= grids.mean(axis=(1, 2), keepdims=True)
+
+
+def subtract_mean_score(grids: Grids, inside: Grids) -> None:
+    """Subtract the mean score of a window from each grid, as often as windows are in the image.
+
+    A window that leaves the image counts 0, as an unrelated one does in the mean: subtracted from
+    all shifts alike, the mean would hold windows near the border in the image, and with them the
+    ground below the camera, by pitch and height.
+    """
+    seen = np.maximum(inside.sum(axis=(1, 2), keepdims=True), 1)
+    grids -= inside * (grids.sum(axis=(1, 2), keepdims=True) / seen)

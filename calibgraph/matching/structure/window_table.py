@@ -9,13 +9,12 @@ from scipy.spatial import cKDTree
 
 from calibgraph.arrays import Array, Mask
 from calibgraph.matching.structure.directions import thin
-from calibgraph.matching.structure.windows import Windows, cut_windows
+from calibgraph.matching.structure.windows import WINDOW, Windows, cut_windows
 from calibgraph.memory import mmap_copy, mmap_zeros
 from calibgraph.parallel import KeyedCache
 
 Rows = NDArray[np.intp]
 
-MIN_RELIABILITY = 0.3  # of a window's variation (0 flat, 1 strong)
 MAX_BYTES, MAX_SELECTED_BYTES = 500_000_000, 220_000_000  # of all tables, and all selections
 _UNCUT, _USELESS = -1, -2
 
@@ -57,7 +56,8 @@ class WindowTable:
         self._tree = cKDTree(directions, balanced_tree=False)
         self._spacing_rad, self._keep_linear = spacing_rad, keep_linear
         self._slots = mmap_copy(np.full(len(centres), _UNCUT, np.int32))
-        self._windows, self._count = Windows.empty(len(centres), mmap_zeros), 0
+        self._windows: Windows = mmap_zeros((len(centres),), WINDOW)
+        self._count = 0
         self._lock = Lock()
 
     def cut(
@@ -78,22 +78,22 @@ class WindowTable:
         if seed:
             chosen = np.random.default_rng(seed).permutation(chosen)
         windows, slots = self._windows, self._slots_of(chosen[:max_windows])
-        rows = windows.members.take(slots, axis=0)
-        covered = (windows.front.take(slots, axis=0) & ~clear.take(rows)).mean(axis=1)
-        return windows.select(slots[in_view.take(rows).all(axis=1) & (covered <= max_covered)])
+        rows = windows["members"][slots]
+        covered = (windows["front"][slots] & ~clear.take(rows)).mean(axis=1)
+        cut: Windows = windows[slots[in_view.take(rows).all(axis=1) & (covered <= max_covered)]]
+        return cut
 
     def _slots_of(self, chosen: Rows) -> Rows:
         """The rows of the windows of those chosen centres that are useful; missing ones are cut."""
         with self._lock:
             missing = chosen[self._slots[chosen] == _UNCUT]
             if len(missing):
-                windows, reliability = cut_windows(
+                windows, useful = cut_windows(
                     self._cloud, self._centres[missing], (self._tree, self._rows),
                     spacing_rad=self._spacing_rad, keep_linear=self._keep_linear,
                 )  # fmt: skip
-                useful = reliability > MIN_RELIABILITY
-                first, self._count = self._count, self._count + int(np.count_nonzero(useful))
-                self._windows.put(first, windows.select(useful))
+                first, self._count = self._count, self._count + len(windows)
+                self._windows[first : self._count] = windows
                 self._slots[missing] = _USELESS
                 self._slots[missing[useful]] = np.arange(first, self._count)
             slots = self._slots[chosen].astype(np.intp)

@@ -18,9 +18,15 @@ from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.files import read_json, sha256
-from calibgraph.matching.structure.window_kernels import FEATURES
 
 Floats = NDArray[np.float32]
+
+FEATURES = (
+    "depth varies", "intensity varies", "share of rays", "log range", "log spread of log range",
+    "share behind", "log width", "log height", "depth beside a plane", "depth in two classes",
+    "log spread of intensity", "intensity beside a trend", "intensity in two classes",
+    "centre behind the median",
+)  # fmt: skip
 
 PACKAGE_FILE = Path(__file__).with_name("window_weights.json")
 LARGEST = 12.0  # of a logit: beyond, the weight is 0 or 1 to single precision

@@ -9,96 +9,57 @@ it. Windows belong to a cloud and a viewpoint: they are cut once, see
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from calibgraph.arrays import Array, Mask
-from calibgraph.matching.structure.window_kernels import (
-    FEATURES,
-    describe_windows,
-    fill_features,
-    make_room,
-)
-from calibgraph.matching.structure.window_weights import WindowNetwork
-
-Rows = NDArray[np.intp]
+from calibgraph.matching.structure.window_weights import FEATURES, WindowNetwork
 
 WINDOW_POINTS = 25  # samples of a window; fewer cannot hold an edge and both its sides
 MIN_WINDOW_POINTS = 9
 WINDOW_STRETCH = 4.0  # longest window by the radius of an even one: room for single scan lines
 MIN_WEIGHT = 0.1  # of a window that counts where windows are weighed
 MIN_SPACING_RAD = np.radians(0.15)  # few sensors sample more finely along their scan lines
+MIN_RELIABILITY = 0.3  # of a window's variation: 0 where it is flat, 1 where much varies
+INTENSITY_NOISE = 0.05  # of intensity ranks: below, a window counts as flat
+DEPTH_NOISE = 0.03  # of relative inverse range: below, a window counts as flat
+SILHOUETTE_SHARE, SILHOUETTE_RATIO = 0.5, 1.25
+SCAN_LINE = 1e-3  # ratio of variances below which a window's rays lie on one line
+_TINY = 1e-12
+
+WINDOW = np.dtype([
+    ("rays_m", "f4", (WINDOW_POINTS, 3)), ("members", "i4", WINDOW_POINTS),
+    ("front", "?", WINDOW_POINTS), ("count", "i4"), ("basis", "f4", (WINDOW_POINTS, 4)),
+    ("features", "f4", len(FEATURES)), ("weight", "f4"),
+], align=True)  # fmt: skip
+"""A correlation window of a cloud.
+
+``rays_m``: from the viewpoint, along the axes of the LiDAR frame, to the points, the window's
+centre first. Points behind a silhouette are moved along their rays to its distance, which
+determines where the silhouette is in the image. ``members``: the same points, as rows of their
+table's rays. ``front``: which of them are not behind a silhouette. ``count``: how many of the
+members are in use: the first ones. ``basis``: columns: inverse range and intensity (orthonormal,
+shrunk where they are flat), and the two linear functions of direction; these are zero where a
+window keeps its linear parts. ``features``: what its weight depends on; zeros where a window does
+not keep its linear parts. ``weight``: how much a window tells where it is, 0 to 1; 1 until it is
+weighed.
+"""
+Windows = NDArray[np.void]
+"""(w,) of WINDOW."""
 
 
-@dataclass(frozen=True, eq=False)
-class Windows:
-    """Correlation windows of one cloud.
+def weigh(windows: Windows, network: WindowNetwork) -> Windows:
+    """Those that tell something, with the shares of variation they explain times the weights.
 
-    Attributes:
-        rays_m: (w, WINDOW_POINTS, 3) from the viewpoint, along the axes of the LiDAR frame, to
-            the points, the window's centre first. Points behind a silhouette are moved along
-            their rays to its distance, which determines where the silhouette is in the image.
-        members: (w, WINDOW_POINTS) the same points, as rows of their table's rays.
-        front: (w, WINDOW_POINTS) which of them are not behind a silhouette.
-        counts: (w,) how many of the members are in use: the first ones.
-        basis: (w, WINDOW_POINTS, 4) columns: inverse range and intensity (orthonormal, shrunk where
-            they are flat), and the two linear functions of direction; these are zero where a
-            window keeps its linear parts.
-        features: (w, f) what its weight depends on, see ``FEATURES``; zeros where a window does
-            not keep its linear parts.
-        weight: (w,) how much a window tells where it is, 0 to 1; 1 until it is weighed.
+    What is left out, a fifth of all, changes no z-score by more than a fiftieth.
     """
-
-    rays_m: NDArray[np.float32]
-    members: NDArray[np.int32]
-    front: Mask
-    counts: NDArray[np.int32]
-    basis: NDArray[np.float32]
-    features: NDArray[np.float32]
-    weight: NDArray[np.float32]
-
-    @staticmethod
-    def empty(count: int, make: Callable[..., NDArray[Any]] = np.empty) -> Windows:
-        """Room for so many windows, in arrays that are made from their shapes and dtypes."""
-        shape = (count, WINDOW_POINTS)
-        return Windows(
-            rays_m=make((*shape, 3), np.float32),
-            members=make(shape, np.int32),
-            front=make(shape, np.bool_),
-            counts=make((count,), np.int32),
-            basis=make((*shape, 4), np.float32),
-            features=make((count, len(FEATURES)), np.float32),
-            weight=make((count,), np.float32),
-        )
-
-    def select(self, rows: Mask | Rows) -> Windows:
-        """Some of the windows."""
-        rows = np.flatnonzero(rows) if rows.dtype == np.bool_ else rows
-        return Windows(**{name: values.take(rows, axis=0) for name, values in vars(self).items()})
-
-    def weighed(self, network: WindowNetwork) -> Windows:
-        """Those that tell something, with the shares of variation they explain times the weights.
-
-        What is left out, a fifth of all, changes no z-score by more than a fiftieth.
-        """
-        weight = network.weights(self.features)
-        kept = replace(self, weight=weight).select(weight > MIN_WEIGHT)
-        return replace(kept, basis=kept.basis * np.sqrt(kept.weight)[:, None, None])
-
-    def put(self, first: int, others: Windows) -> None:
-        """Write others in place of the windows from a row on."""
-        for name, values in vars(others).items():
-            getattr(self, name)[first : first + len(values)] = values
-
-    @property
-    def nbytes(self) -> int:
-        """Size in memory."""
-        return sum(values.nbytes for values in vars(self).values())
+    weight = network.weights(windows["features"])
+    kept = windows[weight > MIN_WEIGHT]
+    kept["weight"] = weight[weight > MIN_WEIGHT]
+    kept["basis"] *= np.sqrt(kept["weight"])[:, None, None]
+    return kept
 
 
 def cut_windows(
@@ -108,7 +69,7 @@ def cut_windows(
     *,
     spacing_rad: float,
     keep_linear: bool,
-) -> tuple[Windows, Array]:
+) -> tuple[Windows, Mask]:
     """Cut windows of the nearest rays.
 
     Args:
@@ -120,27 +81,147 @@ def cut_windows(
         keep_linear: keep the linear parts of the variation, and describe it.
 
     Returns:
-        The windows; (w,) how reliably each can be seen in an image: 0 where it is too small or
-        flat, 1 where much varies.
+        The windows that are large enough and not flat; (w,) which they are.
     """
-    windows, reliability = Windows.empty(len(centres)), np.zeros(len(centres))
     even = math.sqrt(WINDOW_POINTS / math.pi) * max(spacing_rad, MIN_SPACING_RAD)
     reach = 2 * math.sin(WINDOW_STRETCH * even / 2)  # as a chord
     tree, rows = thinned
     _, nearest = tree.query(tree.data[centres], WINDOW_POINTS, distance_upper_bound=reach)
-    near = nearest < tree.n  # fewer are within reach
-    windows.counts[:] = near.sum(axis=1)
-    windows.members[:] = rows[np.where(near, nearest, centres[:, None])]
-    room = make_room(WINDOW_POINTS)
-    describe_windows(
-        cloud, windows.members, windows.counts, keep_linear, room,
-        windows.rays_m, windows.front, windows.basis, reliability,
-    )  # fmt: skip
-    reliability[windows.counts < MIN_WINDOW_POINTS] = 0.0
-    windows.weight[:], windows.features[:] = 1.0, 0.0
+    useful = (nearest < tree.n).sum(axis=1) >= MIN_WINDOW_POINTS  # the others are out of reach
+    nearest, centres = nearest[useful], centres[useful]
+    used = nearest < tree.n
+    members = rows[np.where(used, nearest, centres[:, None])]
+    windows, reliability = describe_windows(cloud, members, used, keep_linear=keep_linear)
+    useful[useful] = reliability > MIN_RELIABILITY
+    return windows[reliability > MIN_RELIABILITY], useful
+
+
+def describe_windows(
+    cloud: tuple[Array, Array], members: NDArray[np.int32], used: Mask, *, keep_linear: bool
+) -> tuple[Windows, Array]:
+    """Windows of members (w, WINDOW_POINTS), of which the first ones are used.
+
+    Returns:
+        The windows; (w,) their reliability, the larger one of inverse range and intensity.
+    """
+    windows = np.zeros(len(members), WINDOW)
+    windows["members"], windows["count"], windows["weight"] = members, used.sum(axis=1), 1.0
+    rays_m, intensity = cloud[0][members], cloud[1][members]
+    inverse = 1.0 / np.sqrt(np.einsum("wpi,wpi->wp", rays_m, rays_m))
+    directions = rays_m * inverse[..., None]
+    near = _find_silhouette(_sort(inverse, used))[:, None]
+    windows["front"] = inverse >= near
+    windows["rays_m"] = directions / np.maximum(inverse, near)[..., None]
+    places = _centre(_places(directions), used)
+    trend = np.zeros_like(places) if keep_linear else _trend(places)
+    relative = inverse / np.mean(inverse, axis=1, keepdims=True, where=used)
+    depth, of_depth = _normalize(relative, used, [*np.moveaxis(trend, 2, 0)], DEPTH_NOISE)
+    shade, of_shade = _normalize(
+        intensity, used, [*np.moveaxis(trend, 2, 0), depth], INTENSITY_NOISE
+    )
+    columns = [of_depth[:, None] * depth, of_shade[:, None] * shade]
+    windows["basis"] = np.dstack([*columns, trend])
     if keep_linear:
-        fill_features(
-            cloud, windows.members, windows.counts, room,
-            windows.front, windows.basis, windows.features,
-        )  # fmt: skip
-    return windows, reliability
+        windows["features"] = _features(windows, used, (inverse, intensity), places)
+    return windows, np.maximum(of_depth, of_shade)
+
+
+def _sort(values: Array, used: Mask) -> Array:
+    """The used values of each window, the least one first; the largest one also in other places."""
+    return np.sort(np.where(used, values, values.max(axis=1, keepdims=True)), axis=1)
+
+
+def _find_silhouette(ordered: Array) -> Array:
+    """(w,) the inverse range of the near side of a window's silhouette; 0 if it has none.
+
+    A silhouette is where the largest gap between a window's inverse ranges is most of what they
+    span: a slope has many gaps.
+    """
+    gaps = np.diff(ordered, axis=1)
+    rows, at = np.arange(len(gaps)), gaps.shape[1] - gaps[:, ::-1].argmax(axis=1)  # the nearest
+    near, far = ordered[rows, at], ordered[rows, at - 1]
+    wide = near - far > SILHOUETTE_SHARE * (ordered[:, -1] - ordered[:, 0])
+    return np.where(wide & (near > SILHOUETTE_RATIO * far), near, 0.0)
+
+
+def _places(directions: Array) -> Array:
+    """(w, p, 2) the directions, along circles of equal elevation and up, about the first one."""
+    x, y, z = directions[:, 0].T
+    flat = np.hypot(x, y)
+    upright = flat > 1e-9  # noqa: PLR2004
+    along_x, along_y = np.where(upright, -y, 1.0), np.where(upright, x, 0.0)
+    along_x, along_y = (values / np.where(upright, flat, 1.0) for values in (along_x, along_y))
+    zero = np.zeros_like(z)
+    up = [-z * along_y, z * along_x, x * along_y - y * along_x]
+    axes = np.array([[along_x, along_y, zero], up])  # (2, 3, w)
+    return np.asarray(directions @ axes.transpose(2, 1, 0))
+
+
+def _trend(places: Array) -> Array:
+    """(w, p, 2) an orthonormal basis of the linear functions of direction in a window.
+
+    Inverse range is linear in direction on any plane, and shading mostly so: without these parts
+    only edges and markings are left to match. A single scan line has one such function only.
+    """
+    powers, axes = np.linalg.eigh(places.transpose(0, 2, 1) @ places)
+    kept = powers > SCAN_LINE * powers[:, 1:]
+    return np.asarray(places @ (axes * (kept / np.sqrt(np.where(kept, powers, 1.0)))[:, None]))
+
+
+def _centre(values: Array, used: Mask) -> Array:
+    """Values (w, p) or (w, p, k) less their mean over those in use; zero where they are not."""
+    used = used.reshape(*used.shape, *[1] * (values.ndim - 2))
+    mean = np.sum(values, axis=1, keepdims=True, where=used) / used.sum(axis=1, keepdims=True)
+    return np.where(used, values - mean, 0.0)
+
+
+def _normalize(values: Array, used: Mask, others: list[Array], noise: float) -> tuple[Array, Array]:
+    """Centre and normalise values (w, p), orthogonal to other columns.
+
+    Inverse range comes first: the part that it shares with the intensity has no reliable sign.
+
+    Returns:
+        The column; (w,) its reliability: 0 where the values are flat, 1 where they vary much.
+    """
+    values = _centre(values, used)
+    for other in others:
+        values = values - (values * other).sum(axis=1, keepdims=True) * other
+    power = (values**2).sum(axis=1)
+    column = values / np.sqrt(power + _TINY)[:, None]
+    return column, np.sqrt(power / (power + used.sum(axis=1) * noise**2))
+
+
+def _features(windows: Windows, used: Mask, values: tuple[Array, Array], places: Array) -> Array:
+    """(w, f) how inverse range and intensity vary over windows, see ``FEATURES``."""
+    (inverse, intensity), count = values, windows["count"]
+    ordered = _sort(inverse, used)
+    median = 1.0 / ordered[np.arange(len(count)), count // 2]
+    power = (windows["basis"][:, :, :2].astype(np.float64) ** 2).sum(axis=1)
+    centred = _centre(np.stack([-np.log(inverse), *values], axis=2), used)
+    spread = np.sqrt((np.dstack([centred, places]) ** 2).sum(axis=1) / count[:, None])
+    beside = _beside_trend(centred[..., 1:], places)
+    return np.column_stack([
+        power, count / used.shape[1], np.log(median), np.log(1e-3 + spread[:, 0]),
+        (~windows["front"] & used).sum(axis=1) / count, np.log(1e-5 + spread[:, 3:]),
+        beside[:, 0], _in_two_classes(ordered, count), np.log(1e-3 + spread[:, 2]),
+        beside[:, 1], _in_two_classes(_sort(intensity, used), count), 1.0 - median * inverse[:, 0],
+    ])  # fmt: skip
+
+
+def _beside_trend(values: Array, places: Array) -> Array:
+    """(w, k) the share of the variation of centred values that no linear function follows."""
+    moments = places.transpose(0, 2, 1) @ places + _TINY * np.eye(2)
+    along = places.transpose(0, 2, 1) @ values
+    followed = (along * np.linalg.solve(moments, along)).sum(axis=1)
+    return np.asarray(1.0 - np.minimum(followed / np.maximum((values**2).sum(axis=1), _TINY), 1.0))
+
+
+def _in_two_classes(ordered: Array, count: NDArray[np.int32]) -> Array:
+    """(w,) the largest share of the variation that lies between two classes (Otsu)."""
+    k, n = np.arange(1, ordered.shape[1] + 1), count[:, None]
+    values = np.where(k <= n, ordered, 0.0)
+    total, below = values.sum(axis=1, keepdims=True), values.cumsum(axis=1)
+    between = np.where(k < n, (below - total * k / n) ** 2 * n / (k * np.maximum(n - k, 1)), 0.0)
+    variation = (values**2).sum(axis=1) - total[:, 0] ** 2 / count
+    share = between.max(axis=1) / np.maximum(variation, _TINY)
+    return np.where(variation > _TINY, share, 0.0)

@@ -18,11 +18,10 @@ from calibgraph.matching.structure.score_kernel import (
     GRAY_NOISE,
     MIN_RESIDUAL_SHARE,
     OPPOSITE,
-    centre_grids,
     pad,
     score_windows,
 )
-from calibgraph.matching.structure.shift_scores import score_frame
+from calibgraph.matching.structure.shift_scores import score_frame, subtract_mean_score
 from calibgraph.model.rig import Camera
 from tests.conftest import SAMPLE
 
@@ -84,8 +83,8 @@ def test_scores_are_those_of_the_formula_wherever_a_window_is_in_the_image(
     counts = rng.integers(9, 13, 100)
     group = np.repeat([0, 1, 3], [30, 50, 20])
     origin = -np.array(size[::-1]) // 2
-    grids, expected = np.zeros((4, *size), np.float32), np.zeros((4, *size))
-    score_windows(
+    grids, (expected, seen) = np.zeros((4, *size), np.float32), np.zeros((2, 4, *size))
+    inside = score_windows(
         pad(image), places.astype(np.int32), counts.astype(np.int32), basis, group.astype(np.int32),
         origin, likelihood, grids,
     )  # fmt: skip
@@ -95,9 +94,11 @@ def test_scores_are_those_of_the_formula_wherever_a_window_is_in_the_image(
             if min(u.min(), v.min()) >= 0 and u.max() < 30 and v.max() < 20:
                 score = formula(image[v, u] - image.mean(), columns[:n], likelihood)
                 expected[g, row, column] += score
+                seen[g, row, column] += 1
     rounding = 50 * 12 * np.finfo(np.float32).eps  # of the windows of a group, and their points
     assert np.count_nonzero(expected) > 0.5 * expected[[0, 1, 3]].size
     np.testing.assert_allclose(grids, expected, rtol=rounding, atol=rounding)
+    np.testing.assert_array_equal(inside, seen if likelihood else seen[:0])
 
 
 def formula(seen: np.ndarray, basis: np.ndarray, likelihood: bool) -> float:
@@ -131,18 +132,12 @@ def test_unrelated_windows_score_no_higher_on_structure_than_on_a_flat_image() -
 
 def test_windows_that_tell_nothing_do_not_hold_a_group_in_the_image() -> None:
     """A score that each window has wherever it is in the image is none; what is above it stays."""
-    rng, size, origin = np.random.default_rng(0), (9, 13), np.array([-6, -4])
-    places = rng.integers([-5, -5], [35, 25], (60, 1, 2)) + rng.integers(-3, 4, (60, 12, 2))
-    counts, group = np.full(60, 12, np.int32), np.repeat([0, 1, 2], 20).astype(np.int32)
-    places[40:] = rng.integers(10, 14, (20, 12, 2))  # a group that never leaves
-    grids = np.zeros((3, *size), np.float32)
-    for row, column in np.ndindex(size):
-        at = places + origin + [column, row]
-        inside = ((at >= 0) & (at < [30, 20])).all(axis=(1, 2))
-        grids[:, row, column] = 0.3 * np.bincount(group, inside, minlength=3)
-    assert np.ptp(grids[:2]) > 1 and np.ptp(grids[2]) == 0
+    inside = np.random.default_rng(0).integers(0, 20, (3, 9, 13)).astype(np.float32)
+    inside[1] = 0  # a group that is never in it
+    inside[2] = 20  # and one that never leaves
+    grids = 0.3 * inside
     grids[2, 4, 6] += 1
-    centre_grids(np.array([20, 30]), places.astype(np.int32), counts, group, origin, grids)
+    subtract_mean_score(grids, inside)
     np.testing.assert_allclose(grids[:2], 0, atol=1e-5)
     assert grids[2, 4, 6] - grids[2, 0, 0] == pytest.approx(1)
     np.testing.assert_allclose(grids.mean(axis=(1, 2)), 0, atol=1e-5)

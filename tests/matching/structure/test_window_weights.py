@@ -7,16 +7,20 @@ import pytest
 from numpy.typing import NDArray
 
 from calibgraph.matching.structure.score_kernel import pad, score_windows
-from calibgraph.matching.structure.window_kernels import FEATURES, fill_features, make_room
-from calibgraph.matching.structure.window_weights import WindowNetwork, window_network
-from calibgraph.matching.structure.windows import WINDOW_POINTS, Windows
+from calibgraph.matching.structure.window_weights import FEATURES, WindowNetwork, window_network
+from calibgraph.matching.structure.windows import (
+    WINDOW,
+    WINDOW_POINTS,
+    Windows,
+    describe_windows,
+    weigh,
+)
 
 Array = NDArray[np.float64]
 
 STEP = np.radians(0.2)
 ALL = np.ones((1, WINDOW_POINTS), np.bool_)
 MEMBERS = np.arange(WINDOW_POINTS, dtype=np.int32)[None]
-COUNTS = np.array([WINDOW_POINTS], np.int32)
 LAYOUT = {"log range"}  # of the features, those that the place of a window changes
 
 
@@ -30,10 +34,8 @@ def grid_of_rays() -> Array:
 
 def features_of(ranges_m: Array, rank: Array, rays: Array | None = None) -> dict[str, float]:
     rays = (grid_of_rays() if rays is None else rays) * ranges_m[:, None]
-    basis, out = np.full((1, WINDOW_POINTS, 4), 0.2, np.float32), np.zeros((1, len(FEATURES)))
-    room = make_room(WINDOW_POINTS)
-    fill_features((rays, rank), MEMBERS, COUNTS, room, ALL, basis, out)
-    return dict(zip(FEATURES, out[0].tolist(), strict=True))
+    windows, _ = describe_windows((rays, rank), MEMBERS, ALL, keep_linear=True)
+    return dict(zip(FEATURES, windows["features"][0].tolist(), strict=True))
 
 
 def test_a_wall_is_a_plane_and_an_edge_is_two_classes() -> None:
@@ -69,23 +71,22 @@ def test_a_weight_lessens_the_share_that_a_window_explains() -> None:
     rng = np.random.default_rng(2)
     image = rng.normal(0, 0.3, (40, 60)).astype(np.float32)
     places = np.stack(np.meshgrid(np.arange(20, 25), np.arange(15, 20)), axis=2)
-    windows = Windows.empty(1)
-    windows.counts[:], windows.features[:] = WINDOW_POINTS, 0.0
+    windows = np.zeros(1, WINDOW)
+    windows["count"] = WINDOW_POINTS
     basis = np.linalg.qr(rng.normal(size=(WINDOW_POINTS, 3)) - [[1, 0, 0]])[0][:, 1:]
     basis -= basis.mean(axis=0)
-    windows.basis[:] = 0.0
-    windows.basis[0, :, :2] = np.linalg.qr(basis)[0]
+    windows["basis"][0, :, :2] = np.linalg.qr(basis)[0]
 
     def scores(of: Windows) -> Array:
         grids = np.zeros((1, 9, 9), np.float32)
         group, first = np.zeros(1, np.int32), np.array([-4, -4])
         at = places.reshape(1, WINDOW_POINTS, 2).astype(np.int32)
-        score_windows(pad(image), at, of.counts, of.basis, group, first, True, grids)
+        score_windows(pad(image), at, of["count"], of["basis"], group, first, True, grids)
         return grids[0].astype(float)
 
     always = np.zeros((len(FEATURES), 1)), np.array([np.log(0.3 / 0.7)])
     network = WindowNetwork(np.zeros(len(FEATURES)), np.ones(len(FEATURES)), (always,))
-    whole, weighed = scores(windows), scores(windows.weighed(network))
+    whole, weighed = scores(windows), scores(weigh(windows, network))
     # Single precision, and a product of factors near 1: some 1e-6 of a logarithm.
     np.testing.assert_allclose(weighed, -np.log(1 - 0.3 * (1 - np.exp(-whole))), atol=1e-5)
     assert np.ptp(whole) > 0.1

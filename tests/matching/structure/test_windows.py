@@ -85,13 +85,13 @@ def test_windows_come_from_clouds_with_and_without_intensity(truth: Rig) -> None
     raw[:, 3] = np.nan
     cloud = PreparedCloud.from_points(raw)
     blind = select_windows(cloud, camera, LEVELS[3], max_windows=10_000)
-    assert len(windows.counts) > len(blind.counts) > 100
+    assert len(windows) > len(blind) > 100
     # Without intensities all ranks are equal: their mean rounds by 1e-16, which the column divides
     # by 1e-6 and weighs by 1e-15.
-    assert np.abs(blind.basis[:, :, 1]).max() < 1e-20
+    assert np.abs(blind["basis"][:, :, 1]).max() < 1e-20
     # Columns are orthogonal to constants and to each other.
     for w in range(50):
-        basis = windows.basis[w, : windows.counts[w]].astype(float)
+        basis = windows["basis"][w, : windows["count"][w]].astype(float)
         np.testing.assert_allclose(basis.sum(axis=0), 0, atol=1e-4)
         gram = basis.T @ basis
         np.testing.assert_allclose(gram - np.diag(np.diag(gram)), 0, atol=1e-4)
@@ -110,9 +110,9 @@ def test_fisheyes_and_views_past_90_degrees_give_windows() -> None:
     cloud = PreparedCloud.from_points(raw)
     windows = select_windows(cloud, camera, LEVELS[2], max_windows=10_000)
     T = camera.T_camera_lidar
-    z = (windows.rays_m.reshape(-1, 3) @ T[:3, :3].T + T[:3, 3])[:, 2]
+    z = (windows["rays_m"].reshape(-1, 3) @ T[:3, :3].T + T[:3, 3])[:, 2]
     assert z.min() < 0 < z.max()
-    assert len(windows.counts) > 100
+    assert len(windows) > 100
 
 
 def test_members_behind_a_silhouette_are_moved_to_it() -> None:
@@ -131,10 +131,10 @@ def test_members_behind_a_silhouette_are_moved_to_it() -> None:
     )
     everywhere = np.ones(len(rays), np.bool_)
     windows = table.cut(everywhere, everywhere, max_covered=0.0, max_windows=10_000)
-    at_edge = ~windows.front.all(axis=1)
+    at_edge = ~windows["front"].all(axis=1)
     assert np.count_nonzero(at_edge) > 20
-    assert windows.rays_m[at_edge][..., 0].max() < 5.2
-    along = windows.rays_m / np.linalg.norm(windows.rays_m, axis=2, keepdims=True)
+    assert windows["rays_m"][at_edge][..., 0].max() < 5.2
+    along = windows["rays_m"] / np.linalg.norm(windows["rays_m"], axis=2, keepdims=True)
     given = rays / np.linalg.norm(rays, axis=1, keepdims=True)
     gap = np.linalg.norm(along.reshape(-1, 1, 3)[:500] - given, axis=2).min(axis=1)
     assert gap.max() < 1e-6  # along their own rays
