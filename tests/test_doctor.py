@@ -101,6 +101,7 @@ def change_clouds(folder: Path, change: Callable[[np.ndarray], np.ndarray]) -> N
         np.save(path, change(np.load(path)))
 
 
+@pytest.mark.usefixtures("no_image_checks")
 @pytest.mark.parametrize(
     ("scale", "expected"),
     [

@@ -44,11 +44,11 @@ def guess(truth: Rig) -> Rig:
     return perturb(truth, rotation_deg=1, translation_m=0.1, seed=3)
 
 
-def table_of(rig: Rig, *, places: bool = True) -> Correspondences:
+def table_of(rig: Rig) -> Correspondences:
     """With an error that its frames share, found where places can be found."""
     errors = MatcherErrors(outlier_share=0.1, frame_noise_px=0.5)
     table = simulate_correspondences(rig, frames=FRAMES, matches=100, errors=errors)
-    stated = STATED | {"z_score": dict.fromkeys(rig.cameras, 30.0)} if places else {}
+    stated = STATED | {"z_score": dict.fromkeys(rig.cameras, 30.0)}
     return replace(table, metadata={**table.metadata, **stated})
 
 

@@ -94,12 +94,6 @@ def _blas_threads() -> set[int]:
     return {library["num_threads"] for library in libraries if library["user_api"] == "blas"}
 
 
-def test_blas_takes_one_thread_while_a_function_has_its_own() -> None:
-    with threadpool_limits(2, user_api="blas"):
-        assert with_own_threads(_blas_threads)() == {1}
-        assert _blas_threads() == {2}
-
-
 def test_calls_that_overlap_leave_blas_its_threads() -> None:
     """The first to begin is the first to end, while the other goes on."""
     entered, over = threading.Event(), threading.Event()

@@ -26,11 +26,11 @@ from benchmarks.accuracy.scenes import Folders
 from benchmarks.tables import ROOT, Table, parser_of, publish
 from calibgraph import Dataset, Rig, load_dataset, simulate_street
 from calibgraph.files import write_text
+from calibgraph.matching.structure.directions import find_places
 from calibgraph.matching.structure.frame_cache import FrameCache, cache_of
 from calibgraph.matching.structure.schedule import LEVELS
-from calibgraph.matching.structure.score_kernel import pad, score_windows
+from calibgraph.matching.structure.score_kernel import score_windows
 from calibgraph.matching.structure.shift_scores import select_windows
-from calibgraph.matching.structure.visibility import find_places
 from calibgraph.matching.structure.window_weights import (
     FEATURES,
     LARGEST,
@@ -206,7 +206,7 @@ def score_each(image: np.ndarray, places: np.ndarray, windows: Windows, reach: i
     grids = np.zeros((count, side, side), np.float32)
     group, first = np.arange(count, dtype=np.int32), np.array([-reach, -reach])
     of_windows = windows["count"], windows["basis"]
-    score_windows(pad(image), places, *of_windows, group, first, True, grids)
+    score_windows(image, places, *of_windows, group, first, True, grids)
     return grids
 
 

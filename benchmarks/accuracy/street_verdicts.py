@@ -19,12 +19,7 @@ import numpy as np
 
 from benchmarks.accuracy import ledger
 from benchmarks.accuracy.cases import DATA
-from benchmarks.accuracy.error_bars import (
-    STREETS,
-    group_parser,
-    render_street,
-    seeds_of,
-)
+from benchmarks.accuracy.error_bars import STREETS, group_parser, render_street, seeds_of
 from benchmarks.accuracy.ledger import Key, Record
 from benchmarks.accuracy.scenes import Folders, Scene
 from benchmarks.accuracy.verdicts import CLASSES, STATUSES, class_of

@@ -25,7 +25,7 @@ from calibgraph.errors import CalibrationError, DatasetError
 from calibgraph.io.dataset import Dataset
 from calibgraph.io.frame import Frame
 from calibgraph.io.rigs import REFERENCE_FILE
-from calibgraph.matching.structure.visibility import find_in_view, find_visible
+from calibgraph.matching.structure.directions import find_in_view, find_visible
 from calibgraph.model.geometry import degrees_and_centimetres, move_points
 from calibgraph.model.rig import Camera
 from calibgraph.pick.estimate import (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -20,12 +21,24 @@ from calibgraph.model.clock import when_taken
 from calibgraph.model.geometry import move_points
 from calibgraph.model.rig import Camera
 from calibgraph.model.verdict import Status
-from calibgraph.report.kit import data_uri, encode
 
 _PICTURES_BYTES = 3_000_000  # of all pictures together; base64 adds a third
 _SIZES = ((1100, 80), (1100, 70), (960, 65), (800, 60), (640, 60), (480, 50), (320, 40))
 _HEIGHT_PX = 640  # at most, so that a picture and its caption fit on a screen
 _STOPS = 17  # of the scale's gradient
+
+
+def encode(picture: NDArray[np.uint8], kind: str, *options: int) -> bytes:
+    """A picture, BGR, as a file of this kind: png or jpeg."""
+    done, data = cv2.imencode(f".{kind}", picture, options)
+    if not done:
+        raise CalibrationError(f"a picture of shape {picture.shape} cannot be encoded as {kind}")
+    return data.tobytes()
+
+
+def data_uri(data: bytes, kind: str = "png") -> str:
+    """The file of a picture as a data URI."""
+    return f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"
 
 
 def draw_overlays(

@@ -9,7 +9,7 @@ import numpy as np
 
 from calibgraph.arrays import Array
 from calibgraph.model.calibration import Calibration
-from calibgraph.report.kit import data_uri, encode
+from calibgraph.report.pictures import data_uri, encode
 from calibgraph.solver.matches import camera_blocks
 from calibgraph.solver.preprocess import preprocess
 

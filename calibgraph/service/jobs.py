@@ -37,7 +37,7 @@ class JobRecord(BaseModel):
     """A job, as it is answered but for what is of the table alone.
 
     Attributes:
-        number, request, starts: in the table; how often it was started.
+        number, request: in the table.
         created, started, finished: times (UTC); null if not yet.
         progress: of a running job.
         verdict: of the result: PASS, WARN or FAIL; of a check OK, WRONG or CANNOT TELL.
@@ -57,7 +57,6 @@ class JobRecord(BaseModel):
     created: Annotated[datetime, Field(validation_alias="created_s")]
     started: Annotated[datetime | None, Field(validation_alias="started_s")]
     finished: Annotated[datetime | None, Field(validation_alias="finished_s")]
-    starts: Annotated[int, Field(exclude=True)]
     verdict: str | None
     cannot_tell: bool | None
     error_kind: ErrorKind | None
@@ -142,35 +141,30 @@ class JobTable:
     def finish(self, id: str, outcome: Outcome) -> None:
         """Give a running job its final state, unless it was cancelled."""
         verdict, cannot_tell = outcome.result or (None, None)
-        self.run(
-            "UPDATE calibgraph_jobs SET state = :state, verdict = :verdict, error = :error, "
-            "cannot_tell = :cannot_tell, error_kind = :kind, finished_s = :now "
-            "WHERE id = :id AND state = 'running'",
-            state="succeeded" if outcome.error_kind is None else "failed", id=id, verdict=verdict,
-            cannot_tell=cannot_tell, kind=outcome.error_kind, error=outcome.error, now=time.time(),
+        self._end(
+            "id = :id AND state = 'running'", id=id, verdict=verdict, cannot_tell=cannot_tell,
+            state="succeeded" if outcome.error_kind is None else "failed",
+            error_kind=outcome.error_kind, error=outcome.error,
         )  # fmt: skip
 
     def cancel(self, id: str) -> bool:
         """Cancel a job; False if it is finished."""
-        changed = self.run(
-            "UPDATE calibgraph_jobs SET state = 'cancelled', finished_s = :now "
-            f"WHERE id = :id AND NOT {_ENDED} RETURNING id", id=id, now=time.time()
-        )  # fmt: skip
-        return bool(changed)
+        return bool(self._end(f"id = :id AND NOT {_ENDED}", id=id, state="cancelled"))
 
     def put_back(self, id: str | None = None) -> int:
         """Let a running job, or all, wait again, and count them; those started too often fail."""
-        which = "WHERE state = 'running' AND coalesce(id = :id, 1)"
-        self.run(
-            "UPDATE calibgraph_jobs SET state = 'failed', error_kind = 'worker died', "
-            f"error = :text, finished_s = :now {which} AND starts >= {MOST_STARTS}",
-            id=id, now=time.time(),
-            text=f"its process or the server ended {MOST_STARTS} times while it ran",
-        )  # fmt: skip
-        again = (
-            f"UPDATE calibgraph_jobs SET state = 'queued', started_s = NULL {which} RETURNING id"
-        )
-        return len(self.run(again, id=id))
+        which = "state = 'running' AND coalesce(id = :id, 1)"
+        text = f"its process or the server ended {MOST_STARTS} times while it ran"
+        often = f"{which} AND starts >= {MOST_STARTS}"
+        self._end(often, id=id, state="failed", error_kind="worker died", error=text)
+        again = f"SET state = 'queued', started_s = NULL WHERE {which} RETURNING id"
+        return len(self.run(f"UPDATE calibgraph_jobs {again}", id=id))
+
+    def _end(self, where: str, *, id: str | None, **values: Any) -> list[Any]:
+        """Give jobs their final values; their ids."""
+        sets = ", ".join(f"{name} = :{name}" for name in (*values, "finished_s"))
+        ended = f"UPDATE calibgraph_jobs SET {sets} WHERE {where} RETURNING id"
+        return self.run(ended, id=id, finished_s=time.time(), **values)
 
     def remove_finished(self, before_s: float) -> list[str]:
         """Forget the jobs that ended before a time; their ids."""

@@ -67,25 +67,8 @@ def pixel_directions(camera: Camera, pixels_px: Array) -> Array:
     return np.asarray(np.where(valid[:, None], directions, 0.0))
 
 
-def render(
-    world: World, rays: CameraRays, T_world_camera: Array, rng: np.random.Generator
-) -> Image:
-    """Render an image.
-
-    Args:
-        world: surfaces and light.
-        rays: of the camera.
-        T_world_camera: (4, 4); camera x is right, y down, z forward.
-        rng: draws exposure and noise.
-
-    Returns:
-        (height, width, 3) BGR.
-    """
-    return develop(trace_light(world, rays, T_world_camera), rng)
-
-
 def develop(linear: Floats, rng: np.random.Generator) -> Image:
-    """The image of linear light, with an exposure, optical blur and noise."""
+    """The BGR image of linear light, with an exposure, optical blur and noise."""
     linear = linear * np.float32(math.exp(rng.normal(0, _EXPOSURE_SPREAD)))
     image = np.asarray(cv2.GaussianBlur(linear, (0, 0), _BLUR_PX)) ** _GAMMA
     image += np.float32(_NOISE) * rng.standard_normal(image.shape, np.float32)
@@ -93,7 +76,10 @@ def develop(linear: Floats, rng: np.random.Generator) -> Image:
 
 
 def trace_light(world: World, rays: CameraRays, T_world_camera: Array) -> Floats:
-    """(height, width, 3) linear BGR light on the pixels; black outside the field of view."""
+    """(height, width, 3) linear BGR light on the pixels; black outside the field of view.
+
+    T_world_camera: (4, 4); camera x is right, y down, z forward.
+    """
     height, width = rays.directions.shape[:2]
     rows = max(1, _BLOCK_PX // width)
     blocks = [rays.directions[row : row + rows] for row in range(0, height, rows)]

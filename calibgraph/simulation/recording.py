@@ -15,7 +15,7 @@ from calibgraph.model.geometry import relative_transform
 from calibgraph.model.metrics import perturb
 from calibgraph.model.rig import Rig
 from calibgraph.progress import Progress, no_progress
-from calibgraph.simulation.cameras import camera_rays, render
+from calibgraph.simulation.cameras import camera_rays, develop, trace_light
 from calibgraph.simulation.lidar import Lidar, SensorErrors, lidar_of, ring_gains, scan
 from calibgraph.simulation.mesh import Mesh
 from calibgraph.simulation.solids import UNIT_X, UNIT_Y, UNIT_Z, to_transform
@@ -174,7 +174,7 @@ def _write_images(folder: Path, rig: Rig, drive: Drive, seed: int, *, progress: 
             progress(f"rendering {name}", index * frames + frame, frames * len(rig.cameras))
             rng = np.random.default_rng([seed, _IMAGE, index, frame])
             T_world_camera = relative_transform(T_world_lidar, camera.T_camera_lidar)
-            image = render(drive.world, rays, T_world_camera, rng)
+            image = develop(trace_light(drive.world, rays, T_world_camera), rng)
             _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
             write_bytes(folder / name / f"{frame:06d}.jpg", data.tobytes())
 

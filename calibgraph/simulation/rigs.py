@@ -6,16 +6,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calibgraph.arrays import Array
-from calibgraph.model.geometry import transform
+from calibgraph.model.geometry import T_OPTICAL_LINK, invert, transform
 from calibgraph.model.rig import Camera, Intrinsics, Rig
 from factors import LensModel
 
 Cameras = dict[str, Camera]
 Views = Mapping[str, tuple[Array | tuple[float, ...], tuple[float, ...]]]
 """By camera, its position in the LiDAR's frame [m], and yaw, pitch and roll [deg]."""
-
-_OPTICAL = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
-"""Rotation of a camera that looks along the LiDAR's x axis; the LiDAR's z axis is up."""
 
 
 def rig_of(name: str) -> Rig:
@@ -66,15 +63,12 @@ def _outwards(yaw_deg: float) -> Array:
 
 
 def _mounted(xyz_m: Array | tuple[float, ...], yaw_pitch_roll_deg: tuple[float, ...]) -> Array:
-    """(4, 4) T_camera_lidar of a camera, from its placement in the LiDAR's frame.
+    """(4, 4) T_camera_lidar of a camera at (3,) x forward, y left, z up in the LiDAR's frame.
 
-    Args:
-        xyz_m: (3,) position; x is forward, y left, z up.
-        yaw_pitch_roll_deg: rotations about z, then y (down is positive), then x.
+    It is turned about z, then y (down is positive), then x.
     """
-    turned = Rotation.from_euler("ZYX", yaw_pitch_roll_deg, degrees=True).as_matrix()
-    R = _OPTICAL @ turned.T
-    return transform(R, -R @ np.asarray(xyz_m))
+    turn = Rotation.from_euler("ZYX", yaw_pitch_roll_deg, degrees=True)
+    return np.asarray(T_OPTICAL_LINK @ invert(transform(turn, xyz_m)))
 
 
 _PAIR_TURN_DEG = (-0.1, 0.9, -0.4)

@@ -3,12 +3,12 @@
 Frame: z is up. Colours are linear, blue, green, red.
 """
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
 
 from calibgraph.arrays import Array
 from calibgraph.errors import needs_extra
@@ -18,8 +18,9 @@ from factors.compiled import compiled
 
 Floats = NDArray[np.float32]
 
-_SUNLIGHT, _SKYLIGHT = (0.98, 1.05, 1.10), (0.50, 0.45, 0.40)
-_HORIZON, _ZENITH, _HAZE_M = (0.85, 0.78, 0.70), (0.62, 0.36, 0.20), 500.0
+_SUNLIGHT, _SKYLIGHT = np.array([[0.98, 1.05, 1.10], [0.50, 0.45, 0.40]], np.float32)
+_HORIZON, _ZENITH = np.array([[0.85, 0.78, 0.70], [0.62, 0.36, 0.20]], np.float32)
+_HAZE_M = 500.0
 _SHADOW_BIAS_M = 0.005
 _TEXELS, _TEXEL_M, _NOISE_SLOPE, _GRAIN_M = 1024, 0.02, 1.1, 0.15
 
@@ -108,9 +109,12 @@ def find_albedos(world: World, directions: Floats, hits: Hits) -> tuple[Array, A
         (n, 4) albedos: blue, green, red, near infrared, and (n,) cosines of the angles of
         incidence; both are 0 where nothing is met.
     """
-    return _albedos(  # type: ignore[no-any-return]
-        directions, hits.triangle, hits.within, world.surfaces, world.paints, world.grain
-    )
+    albedo, incidence = np.zeros((len(directions), 4)), np.zeros(len(directions))
+    met = np.flatnonzero(hits.triangle >= 0)
+    rows = world.surfaces[hits.triangle[met]]
+    albedo[met] = _albedos(world, rows, hits.within[met], 1.0)
+    incidence[met] = _facing_normals(rows, directions[met])[1]
+    return albedo, incidence
 
 
 def shade(
@@ -128,26 +132,25 @@ def shade(
     Returns:
         (n, 3) linear blue, green, red.
     """
-    lit = _find_lit(world, origin_m, directions, hits)
-    colour = np.empty((len(directions), 3), np.float32)
-    _fill_sky(colour, directions)
-    _fill_surfaces(
-        colour, directions, hits.distance_m * np.float32(pixel_rad), hits.triangle, hits.within,
-        lit, world.surfaces, world.paints, world.grain, world.sun,
-    )  # fmt: skip
-    _add_haze(colour, hits.distance_m)
-    return colour
-
-
-def _find_lit(world: World, origin_m: Array, directions: Floats, hits: Hits) -> NDArray[np.bool_]:
-    """(n,) which hits are in direct sunlight."""
-    starts, facing = _shadow_starts(
-        origin_m, directions, hits.distance_m, hits.triangle, world.surfaces, world.sun
+    met = np.flatnonzero(hits.triangle >= 0)
+    rows, rays, distance_m = (
+        of.take(met, axis=0) for of in (world.surfaces[hits.triangle], directions, hits.distance_m)
     )
-    to_sun = np.broadcast_to(world.sun.astype(np.float32), starts.shape)
-    lit = np.zeros(len(directions), np.bool_)
-    lit[facing] = ~world.scene.test_occlusions(_to_rays(starts, to_sun)).numpy()
-    return lit
+    normals, incidence = _facing_normals(rows, rays)
+    sun, origin = world.sun.astype(np.float32), origin_m.astype(np.float32)
+    sunny = np.maximum(normals @ sun, 0.0)
+    facing = np.flatnonzero(sunny)
+    starts = origin + distance_m[facing, None] * rays[facing] + _SHADOW_BIAS_M * normals[facing]
+    shadows = world.scene.test_occlusions(_to_rays(starts, np.broadcast_to(sun, starts.shape)))
+    sunny[facing[shadows.numpy()]] = 0.0
+    clear = 1 / (1 + distance_m * np.float32(pixel_rad / _GRAIN_M) / np.maximum(incidence, 0.05))
+    albedo = _albedos(world, rows, hits.within[met], clear)[:, :3]
+    light = _SUNLIGHT * sunny[:, None] + _SKYLIGHT * (0.7 + 0.3 * normals[:, 2:])
+    through = np.exp(-distance_m / _HAZE_M)[:, None]
+    rise = np.clip(2 * directions[:, 2:], 0.0, 1.0)
+    colour: Floats = _HORIZON + rise * (_ZENITH - _HORIZON)
+    colour[met] = _HORIZON + through * (albedo * light - _HORIZON)
+    return colour
 
 
 def _to_rays(origins: Floats, directions: Floats) -> Any:
@@ -179,99 +182,27 @@ def _noise_texture(rng: np.random.Generator) -> Floats:
     return np.asarray(texture / texture.std(), dtype=np.float32)
 
 
-@compiled()
-def _shadow_starts(origin, directions, distance, triangle, surfaces, sun):  # type: ignore[no-untyped-def]
-    """Points just off the surfaces that face the sun, and the indices of their hits."""
-    starts = np.empty((len(triangle), 3), np.float32)
-    facing = np.empty(len(triangle), np.int64)
-    count = 0
-    for i in range(len(triangle)):
-        if triangle[i] < 0:
-            continue
-        x, y, z, _ = _facing_normal(surfaces[triangle[i]], directions[i])
-        if x * sun[0] + y * sun[1] + z * sun[2] > 0:
-            starts[count, 0] = origin[0] + distance[i] * directions[i, 0] + x * _SHADOW_BIAS_M
-            starts[count, 1] = origin[1] + distance[i] * directions[i, 1] + y * _SHADOW_BIAS_M
-            starts[count, 2] = origin[2] + distance[i] * directions[i, 2] + z * _SHADOW_BIAS_M
-            facing[count] = i
-            count += 1
-    return starts[:count], facing[:count]
+def _facing_normals(rows: Floats, directions: Floats) -> tuple[Floats, Floats]:
+    """The normals on the side of the rays' origin, and the cosines of the angles of incidence."""
+    along = np.einsum("ni,ni->n", rows[:, :3], directions)
+    return np.where(along[:, None] > 0, -rows[:, :3], rows[:, :3]), np.abs(along)
+
+
+def _albedos(
+    world: World, rows: Floats, within: Floats, clear: NDArray[np.floating] | float
+) -> Floats:
+    """(n, 4) the painted albedos at places on triangles; ``clear`` scales the grain."""
+    uv = rows[:, 3:5] + within[:, :1] * rows[:, 5:7] + within[:, 1:] * rows[:, 7:9]
+    texels = uv.T.astype(np.float64) / _TEXEL_M
+    grain = clear * map_coordinates(world.grain, texels, order=1, mode="grid-wrap")
+    albedo = np.empty((len(rows), 4), np.float32)
+    _paint(world.paints, rows, uv, grain, albedo)
+    return albedo
 
 
 @compiled()
-def _albedos(directions, triangle, within, surfaces, paints, grain):  # type: ignore[no-untyped-def]
-    albedo = np.zeros((len(triangle), 4))
-    incidence = np.zeros(len(triangle))
-    for i in range(len(triangle)):
-        if triangle[i] >= 0:
-            row = surfaces[triangle[i]]
-            albedo[i] = _albedo(row, paints, within[i], grain, 1.0)
-            incidence[i] = _facing_normal(row, directions[i])[3]
-    return albedo, incidence
-
-
-@compiled()
-def _fill_sky(colour, directions):  # type: ignore[no-untyped-def]
-    """The sky in every direction, darker and bluer above."""
-    for i in range(len(colour)):
-        rise = min(max(2 * directions[i, 2], 0.0), 1.0)
-        for c in range(3):
-            colour[i, c] = _HORIZON[c] * (1 - rise) + _ZENITH[c] * rise
-
-
-@compiled()
-def _fill_surfaces(  # type: ignore[no-untyped-def]
-    colour, directions, width, triangle, within, lit, surfaces, paints, grain, sun
-):
-    """Lit surfaces; ``width`` is the width of each ray at its hit."""
-    for i in range(len(triangle)):
-        if triangle[i] < 0:
-            continue
-        row = surfaces[triangle[i]]
-        x, y, z, incidence = _facing_normal(row, directions[i])
-        clear = 1 / (1 + width[i] / max(incidence, 0.05) / _GRAIN_M)
-        albedo = _albedo(row, paints, within[i], grain, clear)
-        sunny = (x * sun[0] + y * sun[1] + z * sun[2]) if lit[i] else 0.0
-        for c in range(3):
-            colour[i, c] = albedo[c] * (_SUNLIGHT[c] * sunny + _SKYLIGHT[c] * (0.7 + 0.3 * z))
-
-
-@compiled()
-def _add_haze(colour, distance):  # type: ignore[no-untyped-def]
-    """Blend far surfaces into the colour of the horizon."""
-    for i in range(len(colour)):
-        if distance[i] < math.inf:
-            clear = math.exp(-distance[i] / _HAZE_M)
-            for c in range(3):
-                colour[i, c] = colour[i, c] * clear + _HORIZON[c] * (1 - clear)
-
-
-@compiled()
-def _facing_normal(row, direction):  # type: ignore[no-untyped-def]
-    """The normal on the side of the ray's origin, and the cosine of the angle of incidence."""
-    along = row[0] * direction[0] + row[1] * direction[1] + row[2] * direction[2]
-    sign = -1.0 if along > 0 else 1.0
-    return sign * row[0], sign * row[1], sign * row[2], abs(along)
-
-
-@compiled()
-def _albedo(row, paints, within, grain, clear):  # type: ignore[no-untyped-def]
-    """The painted albedo at a place on a triangle; ``clear`` scales the grain."""
-    u = row[3] + within[0] * row[5] + within[1] * row[7]
-    v = row[4] + within[0] * row[6] + within[1] * row[8]
-    base = (float(row[9]), float(row[10]), float(row[11]), float(row[12]))
-    light = clear * _noise(grain, u, v)
-    return paint_one(paints[int(row[13])], float(u), float(v), light, base)
-
-
-@compiled()
-def _noise(grain, u, v):  # type: ignore[no-untyped-def]
-    """The grain at a place, bilinear between texels."""
-    x, y = u / _TEXEL_M, v / _TEXEL_M
-    column, row = math.floor(x), math.floor(y)
-    p, q = x - column, y - row
-    i, j = int(column) % _TEXELS, int(row) % _TEXELS
-    i_next, j_next = (i + 1) % _TEXELS, (j + 1) % _TEXELS
-    low = grain[i, j] * (1 - p) + grain[i_next, j] * p
-    high = grain[i, j_next] * (1 - p) + grain[i_next, j_next] * p
-    return float(low * (1 - q) + high * q)
+def _paint(paints, rows, uv, grain, albedo):  # type: ignore[no-untyped-def]
+    for i in range(len(rows)):
+        base = (float(rows[i, 9]), float(rows[i, 10]), float(rows[i, 11]), float(rows[i, 12]))
+        paint, u, v = paints[int(rows[i, 13])], float(uv[i, 0]), float(uv[i, 1])
+        albedo[i] = paint_one(paint, u, v, float(grain[i]), base)

@@ -110,9 +110,14 @@ def place_by_cameras(
     both = [_cameras_in(side, of) for side, of in sides]
     seen = [camera for camera in rig.cameras if all(camera in of for of in both)]
     if not seen:
-        raise CalibrationError(f"no camera sees what {rig.lidar} and {name} see")
+        raise CalibrationError(
+            f"{rig.lidar} and {name} share no planes, and no camera sees what both see"
+        )
     base, other = (calibrate(side, _with_cameras(of, seen)) for side, of in sides)
-    found = [n for n in seen if all(_is_found(side, n) for side in (base, other))]
+    found = [
+        n for n in seen if all(side.covariance[n] is not None and side.verdicts[n].status != "FAIL"
+                               for side in (base, other))
+    ]  # fmt: skip
     if not found:
         raise CalibrationError(
             f"{rig.lidar} and {name} share no planes, and of the cameras that see what both see "
@@ -135,10 +140,6 @@ def _with_frames(data: Dataset, name: str, make: Callable[[Frame], Frame]) -> Da
         for of in (data.frames, data.recorded)
     )
     return replace(data, frames=frames, recorded=recorded)
-
-
-def _is_found(result: Calibration, camera: str) -> bool:
-    return result.covariance[camera] is not None and result.verdicts[camera].status != "FAIL"
 
 
 def _joint(result: Calibration, cameras: Sequence[str]) -> Array:

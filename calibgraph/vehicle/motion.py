@@ -43,25 +43,24 @@ class Instant:
 
     Attributes:
         frame: its number in the drive.
-        clouds: per LiDAR (n, 3) as it was recorded, in its own frame.
-        times_s: per LiDAR (n,) of its points after the instant's stamp; None if they have none.
+        returns: per LiDAR (n, 3) its cloud as it was recorded, in its own frame, and (n,) the times
+            of its points [s] after the instant's stamp; None if they have none.
         twist_per_s: (6,) rotation [rad/s] and translation [m/s] of the base; None where it is not
             known to move.
     """
 
     frame: int
-    clouds: Mapping[str, Array]
-    times_s: Mapping[str, Array | None]
+    returns: Mapping[str, tuple[Array, Array | None]]
     twist_per_s: Array | None
 
     @property
     def is_usable(self) -> bool:
         """Whether it stands, or points can be moved."""
-        return self.twist_per_s is None or all(of is not None for of in self.times_s.values())
+        return self.twist_per_s is None or all(of is not None for _, of in self.returns.values())
 
     def at_stamp(self, lidar: str, T_base_lidar: Array | None) -> Array:
         """(n, 3) a cloud at the instant's stamp; as recorded while the pose is unknown."""
-        points, twist, times_s = self.clouds[lidar], self.twist_per_s, self.times_s[lidar]
+        (points, times_s), twist = self.returns[lidar], self.twist_per_s
         if twist is None or times_s is None or T_base_lidar is None:
             return points
         return move_points(
@@ -86,10 +85,8 @@ class Drive:
         """The clouds of a frame, and how the base moved."""
         frame, twist = self.frames[number], self.twist(number)
         moves = bool((np.abs(twist) > _STILL).any())
-        read = {name: frame.load_recorded(name, timed=moves) for name in lidars}
-        clouds = {name: cloud for name, (cloud, _) in read.items()}
-        times_s = {name: times for name, (_, times) in read.items()}
-        return Instant(number, clouds, times_s, twist if moves else None)
+        returns = {name: frame.load_recorded(name, timed=moves) for name in lidars}
+        return Instant(number, returns, twist if moves else None)
 
     def of(self, lidar: str) -> Drive:
         """The drive of another LiDAR, whose motion is by its own clouds."""

@@ -97,10 +97,7 @@ def calibrate_rig_lidars(
         DatasetError: if no instant has all clouds.
         CalibrationError: if a LiDAR shares too little with others.
     """
-    frames = _complete(dataset.frames, rig)
-    warnings = []
-    if left := len(dataset.frames) - len(frames):
-        warnings.append(f"{left} of {len(dataset.frames)} instants lack a cloud and are left out")
+    frames, warnings = _complete(dataset.frames, rig)
     names, files = (rig.lidar, *rig.other_lidars), product(dataset.folders, POSE_FILES)
     path = next((each for pair in files if (each := Path(*pair)).is_file()), None)
     progress("reading clouds of LiDARs", 0, 1)
@@ -112,7 +109,7 @@ def calibrate_rig_lidars(
     progress("locating LiDARs", 0, 1)
     views = _look(instants, guess, rig.lidar)
     start, doubts, lost = locate_lidars(views, guess, base=rig.lidar)
-    parts, placed = list[LidarPoses](), dict[str, LidarPoses]()
+    parts, placed, reasons = list[LidarPoses](), dict[str, LidarPoses](), list[str]()
     if lost:
         progress("joining LiDARs by motion", 0, 1)
         far = {name: T for name, T in guess.items() if name not in start}
@@ -123,27 +120,29 @@ def calibrate_rig_lidars(
         except CalibrationError:
             if len(known) < len(far):
                 raise
-            placed = _placed(known, place)
+            placed, reasons = _placed(known, place)
             missing = {name: T for name, T in known.items() if name not in placed}
             start, line = start | missing, f"{lost}; begun from the guess" if missing else lost
         warnings.append(line)
     progress("calibrating LiDARs", 0, 1)
     if start:
-        parts.append(_solve(instants, views, start, base=rig.lidar))
+        try:
+            parts.append(_solve(instants, views, start, base=rig.lidar))
+        except CalibrationError as error:
+            raise CalibrationError("; ".join([*reasons, f"{error}"])) from error
         bars = parts[-1].covariance
         loose = [n for n in start if guess[n] is not None and _loose(bars[n], rig.lidar)]
-        placed |= _placed(loose, place)
+        placed |= _placed(loose, place)[0]
     if placed:
         parts += placed.values()
         seen = f"placed by cameras that see what it and {rig.lidar} see"
         warnings.append(f"{', '.join(placed)}: {seen}")
     poses = join_poses(parts, [rig.lidar, *guess])
-    clouds = _at_stamps(instants, poses.T_base_lidar)
     vehicle = None
     if rig.vehicle is not None:
         progress("finding the vehicle's frame", 0, 1)
         travel = Travel() if path is None else direction_of_travel(read_poses(path)[0])
-        vehicle, unknown = find_vehicle(rig.vehicle, _road(clouds, poses), travel)
+        vehicle, unknown = find_vehicle(rig.vehicle, _road(instants, poses.T_base_lidar), travel)
         warnings += unknown
     for line in warnings:
         _log.warning(line)
@@ -160,22 +159,22 @@ def calibrate_rig_lidars(
 
 def _placed(
     names: Iterable[str], place: Callable[[str], LidarPoses] | None
-) -> dict[str, LidarPoses]:
-    """The poses of LiDARs by cameras; without those that no camera is calibrated to."""
-    found = {}
+) -> tuple[dict[str, LidarPoses], list[str]]:
+    """The poses of LiDARs by cameras, without those that no camera is calibrated to; and why."""
+    found, reasons = {}, []
     for name in names:
         try:
             if place is not None:
                 found[name] = place(name)
         except CalibrationError as error:
             _log.info("%s", error)
-    return found
+            reasons.append(f"{error}")
+    return found, reasons
 
 
-def _look(
-    instants: Sequence[Instant], T_base_lidar: Mapping[str, Array | None], base: str
-) -> Views:
-    return look(_at_stamps(instants, {base: np.eye(4), **T_base_lidar}))
+def _look(instants: Sequence[Instant], guess: Mapping[str, Array | None], base: str) -> Views:
+    T_base_lidar = {base: np.eye(4), **guess}
+    return look({n: [each.at_stamp(n, T) for each in instants] for n, T in T_base_lidar.items()})
 
 
 def _solve(
@@ -242,22 +241,19 @@ def _turn_by_motion(
         return None
     ups = [
         find_upright("base", [view.points_m for view in maps])[2, :3],
-        find_upright(lidar, [of.clouds[lidar] for of in instants])[2, :3],
+        find_upright(lidar, [of.returns[lidar][0] for of in instants])[2, :3],
     ]
     speed_m_s = np.linalg.norm(both[:, 0], axis=1).max()
     pairs = np.concatenate([both, np.tile(speed_m_s * np.array(ups), (len(both), 1, 1))])
     return transform(Rotation.align_vectors(pairs[:, 0], pairs[:, 1])[0].as_matrix())
 
 
-def _road(clouds: Mapping[str, Sequence[Array]], poses: LidarPoses) -> Road | None:
+def _road(instants: Sequence[Instant], T_base_lidar: Mapping[str, Array]) -> Road | None:
     """The road by the clouds of all LiDARs together; None if they show none."""
     joined = [
-        np.concatenate([
-            move_points(cloud, T)
-            for cloud, T in zip(at, poses.T_base_lidar.values(), strict=True)
-        ])
-        for at in zip(*(clouds[name] for name in poses.T_base_lidar), strict=True)
-    ]  # fmt: skip
+        np.concatenate([move_points(each.at_stamp(n, T), T) for n, T in T_base_lidar.items()])
+        for each in instants
+    ]
     try:
         return find_road(joined)
     except CalibrationError:  # the axes are named as unknown
@@ -282,13 +278,8 @@ def _usable(instants: Sequence[Instant]) -> tuple[list[Instant], list[str]]:
     return usable, lines
 
 
-def _at_stamps(
-    instants: Sequence[Instant], T_base_lidar: Mapping[str, Array | None]
-) -> dict[str, list[Array]]:
-    return {name: [each.at_stamp(name, T) for each in instants] for name, T in T_base_lidar.items()}
-
-
-def _complete(frames: Sequence[Frame], rig: Rig) -> list[Frame]:
+def _complete(frames: Sequence[Frame], rig: Rig) -> tuple[list[Frame], list[str]]:
+    """Those with all clouds, and a line on the others."""
     complete = [frame for frame in frames if {*rig.other_lidars} <= frame.lidar_paths.keys()]
     if not complete:
         counts = {n: sum(n in frame.lidar_paths for frame in frames) for n in rig.other_lidars}
@@ -297,7 +288,9 @@ def _complete(frames: Sequence[Frame], rig: Rig) -> list[Frame]:
             f"no instant has a cloud of every LiDAR: of {len(frames)} of {rig.lidar}, {found}; "
             "clouds of one instant have the same name in each folder lidars/NAME"
         )
-    return complete
+    left = len(frames) - len(complete)
+    line = f"{left} of {len(frames)} instants lack a cloud and are left out"
+    return complete, [line] if left else []
 
 
 def judge_lidar(

@@ -32,7 +32,7 @@ STEP = transform(Rotation.from_euler("z", 0.5, degrees=True), [0.0, 0.03, 0.0])
 TIGHT = {"tolerance_deg": 0.2, "tolerance_cm": 2.0}
 
 
-def poses_of(seed: int, moved: str = "", places: int = 6) -> LidarPoses:
+def poses_of(seed: int, moved: str = "") -> LidarPoses:
     """What a recording gives of LiDARs of which one was moved, or the base under all."""
     rng, others = np.random.default_rng(seed), [name for name in MOUNTS if name != "top"]
     T = {}
@@ -44,7 +44,7 @@ def poses_of(seed: int, moved: str = "", places: int = 6) -> LidarPoses:
         R = Rotation.from_rotvec(turn).as_matrix() @ at[:3, :3]
         T[name] = np.eye(4) if name == "top" else transform(R, at[:3, 3] + shift)
     joint = np.diag(np.tile(SIGMAS**2, len(others)))
-    return LidarPoses("top", T, joint, dict.fromkeys(MOUNTS, 1.0), places, (1.0, 1.0))
+    return LidarPoses("top", T, joint, dict.fromkeys(MOUNTS, 1.0), 6, (1.0, 1.0))
 
 
 def result_of(poses: LidarPoses) -> Calibration:

@@ -5,21 +5,7 @@ import pytest
 from benchmarks.accuracy.ledger import Record
 from calibgraph.model.verdict import FAIL_ABOVE, PASS_BELOW
 from calibgraph.trust.probability import STRUCTURE, WORST
-from tools.probability import (
-    Sample,
-    cuts,
-    discrimination,
-    fit,
-    probabilities,
-    reliability,
-    samples_of,
-)
-
-MODEL = {
-    "intercept": -8.0, "weights": {"outliers": [0.0, 0.0, 16.0]}, "other": [0.0, 0.0, 0.0],
-    "seen": ["outliers"], "value_reliability": 1.0, "bar_odds": 1.0,
-}  # fmt: skip
-"""A check that FAILs makes a result certainly off; no other check says anything."""
+from tools.probability import Sample, fit, probabilities, samples_of
 
 
 def sample(
@@ -31,34 +17,6 @@ def sample(
         by_bar=by_bar, by_values=0.0, off=off, right=not off,
         statuses={kind: status},
     )  # fmt: skip
-
-
-def cells(table: object) -> dict[str, tuple[str, ...]]:
-    return {row[0]: row[1:] for row in table.rows}  # type: ignore[attr-defined]
-
-
-def test_right_results_are_counted_below_the_best_result_that_is_off() -> None:
-    right = [sample(off=False, by_bar=p) for p in (0.001, 0.002, 0.03, 0.2)]
-    off = [sample(off=True, severity=3.0), sample(off=True, by_bar=0.01)]
-    found = cells(discrimination("", MODEL, [*right, *off]))
-    assert found["probability"] == ("50%", "50%")
-
-
-def test_no_result_passes_whose_data_are_missing() -> None:
-    missing = sample(off=False, severity=1.5, kind="frames")
-    found = cells(discrimination("", MODEL, [missing, sample(off=True, by_bar=0.5)]))
-    assert found["probability"] == ("100%", "100%") and found["verdict"] == ("0%", "0%")
-    by_class = cuts("", MODEL, [missing])
-    row = dict(zip(by_class.columns, by_class.rows[0], strict=True))
-    assert row["right: WARN"] == "1" and row["right: PASS"] == "0"
-
-
-def test_a_certain_and_right_probability_has_no_error() -> None:
-    both = [sample(off=False), sample(off=True, severity=3.0)]
-    assert probabilities(MODEL, both) == pytest.approx([3e-4, 0.9997], abs=1e-4)
-    bins = reliability("", MODEL, both)
-    assert bins.title.endswith("mean squared error 0.0000")
-    assert [row[1] for row in bins.rows] == ["1", "1"]
 
 
 def test_a_pose_found_by_chance_counts_beside_a_wrong_lens() -> None:

@@ -10,13 +10,6 @@ import calibgraph
 from calibgraph import FileError, Rig, load_rig
 from calibgraph.cli.settings import RareSettings, read_settings
 from tests.conftest import SAMPLE, Call
-from tests.matching.cmrnext.builders import good_content, saved
-
-
-@pytest.fixture(scope="module")
-def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An untrained network."""
-    return saved(tmp_path_factory.mktemp("weights") / "random.tar", good_content())
 
 
 def test_rare_settings_are_read_from_a_file(tmp_path: Path) -> None:
@@ -32,9 +25,10 @@ def test_rare_settings_are_read_from_a_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_untrained_weights_fail_on_the_command_line(
-    weights: Path, tmp_path: Path, call: Call
-) -> None:
+def test_untrained_weights_fail_on_the_command_line(tmp_path: Path, call: Call) -> None:
+    from tests.matching.cmrnext.builders import good_content, saved
+
+    weights = saved(tmp_path / "random.tar", good_content())
     rig, out = tmp_path / "rig.yaml", tmp_path / "out"
     left = load_rig(SAMPLE).cameras["front_left"]
     Rig(cameras={"front_left": left}).save(rig)

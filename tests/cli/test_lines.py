@@ -6,11 +6,10 @@ import pytest
 
 from calibgraph import load_dataset
 from calibgraph.pick.server import Workspace
-from tests.cli.conftest import error_line
+from tests.cli.conftest import error_line, save_problem
 from tests.conftest import SAMPLE, Call
 from tests.io.bags.writing import sample_bag
 from tests.io.formats.calibration_files import CAMERA_INFO, KALIBR, URDF, write
-from tests.matching.cmrnext.builders import good_content, saved
 
 DEGREES = URDF.replace('rpy="0 0 0"', 'rpy="0 0 90"')
 LINES = """
@@ -105,8 +104,6 @@ CONFIGS = {
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The files that the lines name."""
-    from tests.cli.conftest import save_problem
-
     folder = save_problem(tmp_path_factory.mktemp("lines"))
     (folder / "half.parquet").write_bytes((folder / "table.parquet").read_bytes()[:1000])
     (folder / "bad.yaml").write_text("format: calibgraph-rig/1\ncameras: {a: {fov: 3}}\n")
@@ -122,8 +119,6 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (folder / "drive" / name).symlink_to(SAMPLE / name)
     made = sample_bag(folder / "made", "sqlite3")
     made.rename(folder / "bag")
-    saved(folder / "whole.tar", good_content())
-    (folder / "bad.tar").write_bytes((folder / "whole.tar").read_bytes()[:-5000])
     return folder
 
 

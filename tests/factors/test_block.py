@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import gtsam
@@ -23,8 +22,9 @@ def T_of(pose: gtsam.Pose3) -> np.ndarray:
 
 def separate(block: ProjectionBlock) -> gtsam.NonlinearFactorGraph:
     graph = gtsam.NonlinearFactorGraph()
+    roots = block.sqrt_information
     for k in range(len(block)):
-        s00, s01, s11 = block.sqrt_information[k]
+        s00, s01, s11 = (1.0, 0.0, 1.0) if roots is None else roots[k]
         graph.add(
             projection_factor(
                 KEY,
@@ -44,9 +44,29 @@ def together(block: ProjectionBlock) -> gtsam.NonlinearFactorGraph:
     return graph
 
 
-@pytest.mark.parametrize(("name", "scale"), EACH_LENS_AND_SCALE)
-def test_error_and_linearization_equal_the_separate_factors(name: str, scale: float) -> None:
-    block = replace(world(LENSES[name], 60), scale=scale)
+def with_weights(block: ProjectionBlock, weights: str) -> ProjectionBlock:
+    """The block with no whitening, or with numbers, or with its matrices."""
+    numbers = np.random.default_rng(1).uniform(0.2, 2, len(block))
+    root = np.column_stack([numbers, np.zeros(len(block)), numbers])
+    given = {"none": None, "numbers": root, "matrices": block.sqrt_information}
+    return replace(block, sqrt_information=given[weights])
+
+
+@pytest.mark.parametrize(
+    ("name", "scale", "weights", "count"),
+    [
+        *((*each, "matrices", 60) for each in EACH_LENS_AND_SCALE),
+        # A pinhole whose weights are no matrices has a kernel of its own, with tiles.
+        *(("pinhole", scale, weights, 600) for scale in (3.0, np.inf)
+          for weights in ("numbers", "none")),
+        ("radtan", 3.0, "numbers", 60), ("radtan", np.inf, "none", 60),
+    ],
+)  # fmt: skip
+def test_error_and_linearization_equal_the_separate_factors(
+    name: str, scale: float, weights: str, count: int
+) -> None:
+    """At the last pose some points lie behind the camera."""
+    block = with_weights(replace(world(LENSES[name], count), scale=scale), weights)
     many, one = separate(block), together(block)
     for pose in poses():
         values = at(pose)
@@ -55,40 +75,6 @@ def test_error_and_linearization_equal_the_separate_factors(name: str, scale: fl
         found = one.linearize(values).hessian()
         for a, b in zip(found, expected, strict=True):  # (6, 6) and (6,)
             np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9 * np.abs(b).max())
-
-
-@pytest.mark.parametrize("scale", [3.0, np.inf])
-@pytest.mark.parametrize("weights", ["numbers", "none"])
-@pytest.mark.parametrize("name", ["pinhole", "radtan"])
-def test_numbers_as_weights_equal_the_separate_factors(
-    name: str, weights: str, scale: float
-) -> None:
-    """There is a kernel of its own for a pinhole whose weights are no matrices.
-
-    600 correspondences are more than two of its tiles; at the last pose some lie behind.
-    """
-    numbers = np.random.default_rng(3).uniform(0.2, 2, 600)
-    numbers = np.ones(600) if weights == "none" else numbers
-    roots = np.column_stack([numbers, np.zeros(600), numbers])
-    with_roots = replace(world(LENSES[name], 600), sqrt_information=roots, scale=scale)
-    block = replace(with_roots, sqrt_information=None if weights == "none" else roots)
-    many = separate(with_roots)
-    for pose in poses():
-        expected = many.linearize(at(pose)).hessian()
-        found = together(block).linearize(at(pose)).hessian()
-        assert together(block).error(at(pose)) == pytest.approx(many.error(at(pose)), rel=1e-9)
-        for a, b in zip(found, expected, strict=True):
-            np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9 * np.abs(b).max())
-
-
-def test_sigma_divides_the_whitened_residuals() -> None:
-    block = world(LENSES["pinhole"], 100)
-    divided = replace(block, sqrt_information=block.sqrt_information / 0.7, scale=2.0)
-    found, expected = block.rescale(scale=2.0, sigma=0.7).sums(TRUTH), divided.sums(TRUTH)
-    # Sums of 100 terms, each rounded a few times: 1e-12 of the largest is far above that.
-    for name in ("hessian", "gradient", "cost"):
-        a, b = getattr(found, name), getattr(expected, name)
-        np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12 * np.abs(b).max())
 
 
 @pytest.mark.parametrize(("name", "scale"), EACH_LENS_AND_SCALE)
@@ -117,38 +103,6 @@ def test_the_curvature_is_the_derivative_of_the_gradient(name: str, scale: float
         block.summarize(T_of(TRUTH), runs).hessian / whole.max(),
         atol=1e-13,
     )
-
-
-@pytest.mark.parametrize("plain", [False, True])
-def test_joined_blocks_are_the_block_of_all_rows(plain: bool) -> None:
-    """To the last bit; a block without whitening counts as one with the identity."""
-    whole = world(LENSES["radtan"], 90)
-    parts = [whole.select(np.arange(k, k + 30)) for k in (0, 30, 60)]
-    if plain:
-        parts[1] = replace(parts[1], sqrt_information=None)
-        roots = whole.sqrt_information.copy()
-        roots[30:60] = [1.0, 0.0, 1.0]
-        whole = replace(whole, sqrt_information=roots)
-    joined = ProjectionBlock.join(parts)
-    for name in ("points_lidar_m", "pixels_px", "sqrt_information"):
-        np.testing.assert_array_equal(getattr(joined, name), getattr(whole, name))
-    found, expected = joined.sums(TRUTH), whole.sums(TRUTH)
-    np.testing.assert_array_equal(found.hessian, expected.hessian)
-    assert found.cost == expected.cost
-
-
-def test_other_whitening_leaves_the_correspondences_in_their_place() -> None:
-    block = world(LENSES["pinhole"], 40)
-    roots = np.random.default_rng(0).uniform(0.1, 1.0, (40, 3))
-    other = block.rewhiten(roots)
-    assert other.points_lidar_m.base is block.points_lidar_m.base
-    for given in (roots, roots[:, [0, 0, 0]] * [1, 0, 1], None):
-        found, expected = (b.sums(TRUTH) for b in (
-            block.rewhiten(given), replace(block, sqrt_information=given)))  # fmt: skip
-        np.testing.assert_array_equal(found.hessian, expected.hessian)
-        assert found.cost == expected.cost
-    with pytest.raises(ValueError, match=r"sqrt_information\[3\] is not finite"):
-        block.rewhiten(np.where(np.arange(40)[:, None] == 3, np.nan, roots))
 
 
 def test_far_residuals_do_not_leave_the_range_of_a_float() -> None:
@@ -231,25 +185,12 @@ def test_a_factor_is_that_of_its_own_block_whatever_was_evaluated_before() -> No
             assert 2 * factors[id(b)].error(at(pose)) == pytest.approx(expected.cost, rel=1e-12)
 
 
-def test_threads_get_the_sums_of_their_own_pose() -> None:
-    """One factor, evaluated at many poses by several threads at once."""
-    factor = block_factor(KEY, world(LENSES["pinhole"], 500))
-    many = [TRUTH.retract(0.01 * k * np.ones(6)) for k in range(20)]
-    alone = [factor.error(at(pose)) for pose in many]
-    with ThreadPoolExecutor(4) as pool:
-        found = list(pool.map(lambda k: factor.error(at(many[k % 20])), range(400)))
-    assert found == [alone[k % 20] for k in range(400)]
-
-
 EDGES = np.array([0, 300, 300, 900, 1000])
 
 
 def blocks(lens: str) -> list[ProjectionBlock]:
-    """Without whitening, with numbers, and with matrices."""
-    matrices = world(LENSES[lens], 1000)
-    numbers = np.random.default_rng(1).uniform(0.2, 2, 1000)
-    root = np.column_stack([numbers, np.zeros(1000), numbers])
-    return [replace(matrices, sqrt_information=given) for given in (None, root)] + [matrices]
+    block = world(LENSES[lens], 1000)
+    return [with_weights(block, weights) for weights in ("none", "numbers", "matrices")]
 
 
 def T_camera_lidar() -> np.ndarray:
@@ -267,14 +208,8 @@ def test_runs_at_poses_of_their_own_have_the_sums_of_their_blocks(lens: str) -> 
             assert found.cost[i] == pytest.approx(expected.cost, rel=1e-12)
             most = np.abs(expected.hessian).max(initial=1.0)
             np.testing.assert_allclose(found.hessian[i], expected.hessian, atol=1e-12 * most)
-
-
-@pytest.mark.parametrize("lens", LENSES)
-def test_a_block_at_many_poses_has_the_costs_of_each(lens: str) -> None:
-    for block in blocks(lens):
-        each = [block.sums(pose) for pose in poses()[1:]]
-        costs = block.costs_at_each(T_camera_lidar())
-        np.testing.assert_allclose(costs, [one.cost for one in each], rtol=1e-12)
+        costs = [block.sums(pose).cost for pose in poses()[1:]]
+        np.testing.assert_allclose(block.costs_at_each(T), costs, rtol=1e-12)
 
 
 @pytest.mark.parametrize("lens", LENSES)

@@ -8,16 +8,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from factors import (
-    Clock,
-    Columns,
-    Lens,
-    ProjectionBlock,
-    displace,
-    fields_px,
-    placed_factor,
-    to_runs,
-)
+from factors import Clock, Columns, Lens, ProjectionBlock, displace, placed_factor, to_runs
 from factors.columns import COEFFICIENT_NUMBERS, DISTORTION
 from tests.draws.places import distortions_at
 from tests.factors.blocks import KEY, LENSES, TRUTH, K, at, poses, world
@@ -38,10 +29,10 @@ def free(name: str, *, clock: bool = False) -> Columns:
     return Columns(lens, tuple(sigmas), tuple(sigmas.values()), Clock(0.01, 0.005, HEIGHT_PX))
 
 
-def moving(name: str, count: int, *, alike: bool = False) -> ProjectionBlock:
+def moving(name: str, count: int) -> ProjectionBlock:
     """Correspondences of a LiDAR that moves, each with its own twist."""
     block, rng = world(LENSES[name], count), np.random.default_rng(2)
-    twists = TWIST * (np.ones((count, 1)) if alike else rng.uniform(0.5, 1.5, (count, 6)))
+    twists = TWIST * rng.uniform(0.5, 1.5, (count, 6))
     return replace(block, motion=np.column_stack([twists, np.zeros(count)]))
 
 
@@ -121,33 +112,17 @@ def test_equals_factors_of_gtsam(stock, calibration, distortion, parameters) -> 
     chain[6, 6:8], chain[7, 6:8] = [K["fx"], K["fx"] / 2], [K["fy"], -K["fy"] / 2]
     chain[9:, 8:] = np.eye(2 + len(parameters))
     ours = with_lens(pose, np.zeros(len(names)))
-    require_equal((block, free_lens), ours, factors, theirs, [KEY, KEY_LENS], chain)
-
-
-def require_equal(
-    of: tuple[ProjectionBlock, Columns],
-    ours: gtsam.Values,
-    factors: list[gtsam.NonlinearFactor],
-    theirs: gtsam.Values,
-    keys: list[int],
-    chain: np.ndarray,
-) -> None:
-    """Error and linearization at ``ours`` are those of GTSAM's factors, one for each fixed point.
-
-    ``chain`` has the derivatives of their variables ``keys`` by pose and lens.
-    """
     one, many = gtsam.NonlinearFactorGraph(), gtsam.NonlinearFactorGraph()
-    one.add(placed_factor([KEY_CLOUD, KEY, KEY_LENS], *of))
+    one.add(placed_factor([KEY_CLOUD, KEY, KEY_LENS], block, free_lens))
     for number, (factor, point) in enumerate(
-        zip(factors, of[0].points_lidar_m, strict=True), start=FIRST_POINT
+        zip(factors, block.points_lidar_m, strict=True), start=FIRST_POINT
     ):
         many.add(factor)
         theirs.insert(number, point)
-    points = [*range(FIRST_POINT, FIRST_POINT + len(factors))]
-    size = len(chain)
-    order = to_ordering([KEY_CLOUD, KEY, KEY_LENS])
-    whole = to_ordering([*keys, *points])
+    points, size = range(FIRST_POINT, FIRST_POINT + len(factors)), len(chain)
+    whole = to_ordering([KEY, KEY_LENS, *points])
     hessian, gradient = (part[:size, ...] for part in many.linearize(theirs).hessian(whole))
+    order = to_ordering([KEY_CLOUD, KEY, KEY_LENS])
     found = [part[6:, ...] for part in one.linearize(ours).hessian(order)]
     np.testing.assert_allclose(2 * one.error(ours), 2 * many.error(theirs), rtol=1e-9)
     expected, pulled = chain.T @ hessian[:, :size] @ chain, chain.T @ gradient
@@ -195,24 +170,6 @@ def test_refuses_parameters_that_a_lens_does_not_have() -> None:
         Columns(LENSES["radtan"], ("k4",), (1.0,))
 
 
-def test_equals_factors_of_gtsam_on_a_camera_that_moves_on() -> None:
-    """Stock factors on the pose exp(xi t) X of the camera at the time of its image."""
-    block = replace(moving("pinhole", 20, alike=True), sqrt_information=None, scale=np.inf)
-    free = Columns(LENSES["pinhole"], ("offset",), (1.0,))
-    calibration = gtsam.Cal3_S2(K["fx"], K["fy"], 0.0, K["cx"], K["cy"])
-    pose, late = TRUTH.retract(np.full(6, 0.01)), 0.05
-    moved = gtsam.Pose3.Expmap(late * TWIST) * pose
-    factors = [
-        gtsam.GenericProjectionFactorCal3_S2(
-            pixel, gtsam.noiseModel.Unit.Create(2), KEY, number, calibration
-        )
-        for number, pixel in enumerate(block.pixels_px, start=FIRST_POINT)
-    ]
-    chain = np.column_stack([np.eye(6), moved.inverse().AdjointMap() @ TWIST])
-    ours = with_lens(pose, np.array([late]))
-    require_equal((block, free), ours, factors, at(moved), [KEY], chain)
-
-
 def test_points_that_have_been_moved_are_moved_on() -> None:
     """A block at one clock has the residuals of the recorded points at that clock."""
     free = Columns(LENSES["radtan"], ("offset", "readout"), (0.1, 0.1), Clock(0, 0, HEIGHT_PX))
@@ -225,15 +182,6 @@ def test_points_that_have_been_moved_are_moved_on() -> None:
     np.testing.assert_allclose(there, recorded, atol=1e-9 * np.abs(recorded).max())
 
 
-def test_displacement_is_that_of_the_exponential() -> None:
-    points = np.random.default_rng(3).normal(0, 20, (30, 3))
-    for rate in (1.0, 1e-4, 0.0):
-        twist = TWIST * [rate, rate, rate, 1, 1, 1]
-        T = gtsam.Pose3.Expmap(0.3 * twist).matrix()
-        expected = points @ T[:3, :3].T + T[:3, 3]
-        np.testing.assert_allclose(displace(points, twist, 0.3), expected, atol=1e-9)
-
-
 def test_without_motion_or_at_rest_the_clock_is_not_observable() -> None:
     free = Columns(LENSES["pinhole"], ("offset", "readout"), (0.02, 0.02))
     still = world(LENSES["pinhole"], 20)
@@ -241,15 +189,6 @@ def test_without_motion_or_at_rest_the_clock_is_not_observable() -> None:
     for block in (still, parked):
         columns = block.columns(TRUTH.inverse().matrix(), free, np.ones(2))
         assert not columns[6:8].any()
-
-
-def test_the_motion_stays_with_its_correspondences() -> None:
-    block, rows = moving("pinhole", 12), np.array([7, 2, 5])
-    parts = [block.select(rows), block.select(np.arange(3)).rewhiten(None)]
-    expected = block.motion[[*rows, 0, 1, 2]]
-    joined = ProjectionBlock.join(parts)
-    np.testing.assert_array_equal(joined.motion, expected)
-    assert ProjectionBlock.join([world(LENSES["pinhole"], 4)] * 2).motion is None
 
 
 def test_the_columns_of_a_scan_distortion_displace_the_points() -> None:
@@ -299,16 +238,3 @@ def test_sums_of_runs_are_those_of_the_columns(name: str, scale: float) -> None:
         sums = losses.sum(), weights.sum(), weights @ s
         mine = found.cost[run], found.weights[run], found.squares[run]
         np.testing.assert_allclose(mine, sums, rtol=1e-12)
-
-
-def test_plain_fields_are_derivatives_of_pixels_by_twist_and_lens() -> None:
-    block, lens = moving("radtan", 20), free("radtan", clock=True)
-    pixels, fields = fields_px(block.points_lidar_m, TRUTH.inverse().matrix(), lens, TWIST)
-    seen = replace(block, pixels_px=pixels, sqrt_information=None)
-    seen = replace(seen, motion=np.column_stack([np.tile(TWIST, (20, 1)), np.zeros(20)]))
-    shift = lens.clock.times_s(pixels[:, 1])
-    seen = replace(seen, motion=np.column_stack([np.tile(TWIST, (20, 1)), shift]))
-    columns = seen.columns(TRUTH.inverse().matrix(), lens)
-    np.testing.assert_allclose(columns[-1], 0.0, atol=1e-9)
-    np.testing.assert_array_equal(fields[6:], columns[6:-1])
-    np.testing.assert_array_equal(fields[:6], -columns[:6])

@@ -8,21 +8,15 @@ import pytest
 from numpy.typing import NDArray
 
 from factors import Lens, ray_spreads, unproject
+from tests.conftest import KANNALA, RADTAN5, RADTAN8
+from tests.factors.blocks import K
 
 Array = NDArray[np.float64]
 
-K = {"fx": 718.0, "fy": 710.0, "cx": 607.0, "cy": 185.0}
 MATRIX = np.array([[718.0, 0, 607], [0, 710.0, 185], [0, 0, 1]])
-RADTAN = {
-    0: (),
-    4: (-0.11, 0.05, 0.001, -0.002),
-    5: (-0.11, 0.05, 0.001, -0.002, 0.004),
-    8: (0.3, -0.1, 0.0005, 0.001, 0.02, 0.35, -0.05, 0.01),
-}
-KANNALA = (0.02, -0.004, 0.001, -0.0002)
+RADTAN = {0: (), 4: RADTAN5[:4], 5: RADTAN5, 8: RADTAN8}
 MIRROR = (-0.06, 0.02, 0.001, -0.002)
 XI = [0.0, 0.7, 1.0, 1.6, 2.8]
-WIDTH, HEIGHT = 2000, 1000
 ALL_ROUND = {f"xi {xi}": Lens.of("omnidirectional", **K, distortion=(xi, *MIRROR)) for xi in XI}
 LENSES = {f"radtan{n}": Lens.of("pinhole", **K, distortion=d) for n, d in RADTAN.items()}
 LENSES["fisheye"] = Lens.of("fisheye", **K, distortion=KANNALA)
@@ -185,14 +179,6 @@ def test_a_distortion_is_valid_up_to_where_it_folds_back() -> None:
         points = np.array([[limit - 0.003, 0, 1], [limit + 0.003, 0, 1], [1.5, 0, 1]])
         assert lens.project(points)[1].tolist() == [True, False, False]
         assert np.isfinite(lens.project_with_jacobian(points)[1]).all()
-
-
-def test_where_opencv_folds_back_the_projection_goes_on() -> None:
-    lens = Lens.of("pinhole", **K, distortion=(-0.3, 0.0, 0.0, 0.0))
-    points = np.column_stack([[0.5, 1.05, 1.06, 1.5], np.zeros(4), np.ones(4)])
-    folded = cv2.projectPoints(points, np.zeros(3), np.zeros(3), MATRIX, lens.packed[4:8])[0]
-    assert folded[3, 0, 0] < folded[1, 0, 0]
-    assert np.all(np.diff(lens.project(points)[0][:, 0]) > 0)
 
 
 @pytest.mark.parametrize("name", LENSES)

@@ -8,12 +8,10 @@ import pytest
 from gtsam import Pose3
 
 from factors import (
-    camera_prior_factor,
     pose_sigmas,
     projection_factor,
     projection_residual,
     relative_pose_factor,
-    relative_prior_factor,
     smallest_scaled_eigenvalues,
     unit_diagonal,
 )
@@ -62,11 +60,8 @@ def test_projection_factor_equals_gtsams_stock_factor() -> None:
         np.testing.assert_allclose(b, right, rtol=1e-9, atol=1e-9)
 
 
-SIZES = [1e-7, 0.01, 0.5, 1.0]
-
-
-def random_pose(rng: np.random.Generator, size: float = 1.0) -> Pose3:
-    return Pose3.Expmap(np.concatenate([rng.standard_normal(3), 3 * rng.standard_normal(3)]) * size)
+def random_pose(rng: np.random.Generator) -> Pose3:
+    return Pose3.Expmap(rng.standard_normal(6) * [1, 1, 1, 3, 3, 3])
 
 
 def values_of(*transforms: Pose3) -> gtsam.Values:
@@ -75,33 +70,6 @@ def values_of(*transforms: Pose3) -> gtsam.Values:
     for key, T in enumerate(transforms):
         result.insert(key, T.inverse())
     return result
-
-
-@pytest.mark.parametrize("size", SIZES)
-def test_camera_prior_is_the_papers_formula(size: float) -> None:
-    rng = np.random.default_rng(1)
-    for _ in range(20):
-        T_hat = random_pose(rng)
-        T = T_hat.compose(random_pose(rng, 0.3 * size))
-        weight = rng.uniform(0.5, 10)
-        paper = weight * np.sum(Pose3.Logmap(T_hat.inverse().compose(T)) ** 2)
-        factor = camera_prior_factor(0, T_hat.matrix(), weight=weight)
-        assert 2 * factor.error(values_of(T)) == pytest.approx(paper, rel=1e-7)
-
-
-@pytest.mark.parametrize("size", SIZES)
-def test_relative_prior_is_the_papers_formula(size: float) -> None:
-    rng = np.random.default_rng(2)
-    for _ in range(20):
-        T_hat_1, T_hat_2 = random_pose(rng), random_pose(rng)
-        T_1 = T_hat_1.compose(random_pose(rng, 0.2 * size))
-        T_2 = T_hat_2.compose(random_pose(rng, 0.2 * size))
-        weight = rng.uniform(0.5, 10)
-        T_hat_12 = T_hat_2.compose(T_hat_1.inverse())
-        difference = T_hat_12.inverse().compose(T_2).compose(T_1.inverse())
-        paper = weight * np.sum(Pose3.Logmap(difference) ** 2)
-        factor = relative_prior_factor(0, 1, T_hat_12.matrix(), weight=weight)
-        assert 2 * factor.error(values_of(T_1, T_2)) == pytest.approx(paper, rel=1e-7)
 
 
 def test_relative_pose_is_exact_at_the_truth_and_costs_one_at_one_sigma() -> None:
@@ -124,16 +92,9 @@ def test_sigmas_are_rotation_first() -> None:
     assert pose_sigmas(rotation_rad=1.0, translation_m=2.0).tolist() == [1, 1, 1, 2, 2, 2]
 
 
-def random_hessian(seed: int = 0) -> np.ndarray:
-    root = np.random.default_rng(seed).standard_normal((9, 6))
+def random_hessian() -> np.ndarray:
+    root = np.random.default_rng(0).standard_normal((9, 6))
     return root.T @ root
-
-
-def test_the_diagonal_becomes_one_and_the_units_undo_it() -> None:
-    hessian = random_hessian()
-    scaled, units = unit_diagonal(hessian)
-    np.testing.assert_allclose(np.diag(scaled), 1.0, rtol=1e-15)
-    np.testing.assert_allclose(scaled * np.outer(units, units), hessian, rtol=1e-14)
 
 
 def test_the_smallest_eigenvalue_does_not_depend_on_units() -> None:

@@ -35,8 +35,13 @@ WRONG: dict[str, Any] = {
 }
 
 
-@pytest.mark.parametrize("number", [float("inf"), float("nan"), 1e308, -1e308])
-@pytest.mark.parametrize("key", ["covariance", "timings_s", "residuals", "rounds", "error_sources"])
+@pytest.mark.parametrize(
+    ("key", "number"),
+    [
+        *(("covariance", number) for number in (float("inf"), float("nan"), 1e308, -1e308)),
+        *((key, 1e308) for key in ("timings_s", "residuals", "rounds", "error_sources")),
+    ],
+)
 def test_numbers_that_no_measurement_has_are_refused(
     key: str, number: float, calibrated_sample: CommandRun, tmp_path: Path
 ) -> None:
@@ -134,9 +139,9 @@ def test_tables_of_the_result_before_do_not_stay_beside_the_new_one(
     result = load_calibration(calibrated_sample.folder)
     write_result(result, tmp_path)
     without = replace(result, correspondences=None, camera_matches=None)
-    (written,) = write_result(without, tmp_path, with_report=False)
-    assert written == tmp_path / "calibration.yaml"
-    assert {path.name for path in tmp_path.iterdir()} == {"calibration.yaml", "report.html"}
+    written = write_result(without, tmp_path, with_report=False)
+    assert written[0] == tmp_path / "calibration.yaml"
+    assert {*tmp_path.iterdir()} == {*written, tmp_path / "report.html"}
 
 
 def test_a_result_of_much_metadata_is_replaced_but_no_table_of_others(

@@ -21,8 +21,7 @@ from calibgraph.io.bags.pictures import image_from_message
 from calibgraph.io.dataset import keep_frames
 from calibgraph.io.frame import ScanMotion, twist_between
 from calibgraph.io.images import load_image
-from calibgraph.matching.camera_pairs.find import FEATURE, Features, features_of
-from calibgraph.matching.structure.frame_cache import FrameCache, cache_of
+from calibgraph.matching.camera_pairs.find import FEATURE, features_of
 from calibgraph.pipeline import hash_inputs
 from tests.conftest import SAMPLE, make_camera
 
@@ -232,33 +231,17 @@ def test_features_of_kept_frames_are_found_once_per_lens() -> None:
     np.testing.assert_array_equal(plain, found)
 
 
-def test_kept_frames_share_one_cache_of_windows() -> None:
-    data, own = calibgraph.load_dataset(SAMPLE), FrameCache()
-    kept = keep_frames(data)
-    assert keep_frames(kept) is kept
-    assert cache_of(kept.frames, own) is cache_of(kept.frames[2:], own) is not own
-    assert cache_of(data.frames, own) is own
-    assert cache_of(keep_frames(data).frames, own) is not cache_of(kept.frames, own)
-
-
 def test_what_was_used_last_is_kept_up_to_a_size(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(kept_frames, "MAX_BYTES", 2 * size(100))
+    value = np.zeros(100, FEATURE)
+    monkeypatch.setattr(kept_frames, "MAX_BYTES", 2 * value.nbytes)
     frame, made = keep_frames(calibgraph.load_dataset(SAMPLE)).frames[0], list[str]()
 
     def derive(key: str) -> None:
-        frame.derive(key, lambda: made.append(key) or of(100))
+        frame.derive(key, lambda: made.append(key) or value)
 
     for key in "aabacab":
         derive(key)
     assert "".join(made) == "abcb"
-
-
-def of(rows: int) -> Features:
-    return np.zeros(rows, FEATURE)
-
-
-def size(rows: int) -> int:
-    return of(rows).nbytes
 
 
 RNG = np.random.default_rng(4)

@@ -107,26 +107,26 @@ def tables_of(data: Dataset, *, scene: str = "scene-0001") -> Tables:
     return tables
 
 
-def write_files(folder: Path, data: Dataset, scene: str = "scene-0001") -> None:
+def write_files(folder: Path, data: Dataset) -> None:
     """Scans of x y z intensity ring, and images."""
     for number, frame in enumerate(data.frames):
-        scan = folder / "samples" / "LIDAR_TOP" / f"{scene}-{number}.pcd.bin"
+        scan = folder / "samples" / "LIDAR_TOP" / f"scene-0001-{number}.pcd.bin"
         scan.parent.mkdir(parents=True, exist_ok=True)
         cloud = frame.load_cloud()
         ring = np.arange(len(cloud), dtype=np.float32) % 32
         np.column_stack([cloud, ring]).astype("<f4").tofile(scan)
         for name, path in frame.image_paths.items():
-            image = folder / "samples" / name / f"{scene}-{number}{path.suffix}"
+            image = folder / "samples" / name / f"scene-0001-{number}{path.suffix}"
             image.parent.mkdir(parents=True, exist_ok=True)
             shutil.copy(path, image)
 
 
-def write_tables(folder: Path, *parts: Tables, version: str = "v1.0-mini") -> None:
+def write_tables(folder: Path, *parts: Tables) -> None:
     """Write the tables; records of several scenes one after another, sensors once."""
-    (folder / version).mkdir(parents=True, exist_ok=True)
+    (folder / "v1.0-mini").mkdir(parents=True, exist_ok=True)
     for table in parts[0]:
         records = {each["token"]: each for part in parts for each in part[table]}
-        (folder / version / f"{table}.json").write_text(json.dumps(list(records.values())))
+        (folder / "v1.0-mini" / f"{table}.json").write_text(json.dumps(list(records.values())))
 
 
 def pcd(encoding: str = "binary", *, padding: bool = False) -> bytes:
@@ -135,9 +135,9 @@ def pcd(encoding: str = "binary", *, padding: bool = False) -> bytes:
     return pcd_of(rows, encoding)
 
 
-def fields_of(cloud: NDArray[np.float32], kind: str = "<f4") -> NDArray[np.void]:
+def fields_of(cloud: NDArray[np.float32]) -> NDArray[np.void]:
     """(n,) x, y, z, intensity of a cloud."""
-    rows = np.zeros(len(cloud), [(name, kind) for name in ("x", "y", "z", "intensity")])
+    rows = np.zeros(len(cloud), [(name, "<f4") for name in ("x", "y", "z", "intensity")])
     for column, name in enumerate(rows.dtype.names or ()):
         rows[name] = cloud[:, column]
     return rows
@@ -154,15 +154,12 @@ def padded() -> NDArray[np.void]:
     return rows
 
 
-def pcd_of(
-    rows: NDArray[np.void], encoding: str = "binary", first: str = "", points: int = 0
-) -> bytes:
+def pcd_of(rows: NDArray[np.void], encoding: str = "binary", points: int = 0) -> bytes:
     """The .pcd of a structured array; names that begin with _ are padding.
 
     Args:
         rows: (n,) fields, of several numbers each, too.
         encoding: of DATA.
-        first: lines above the header.
         points: as the header states it; their number if 0.
     """
     names = rows.dtype.names or ()
@@ -178,7 +175,7 @@ def pcd_of(
         "DATA": [encoding],
     }  # fmt: skip
     lines = "".join(f"{key} {' '.join(map(str, words))}\n" for key, words in header.items())
-    return (first + lines).encode() + _BODIES[encoding](rows)
+    return lines.encode() + _BODIES[encoding](rows)
 
 
 def _text(rows: NDArray[np.void]) -> bytes:
@@ -222,11 +219,11 @@ def ply_of(rows: NDArray[np.void], encoding: str, *, after: bytes = b"") -> byte
 
 def ply(
     encoding: str = "binary_little_endian", *, after: bytes = b"",
-    body: bytes | None = None, names: tuple[str, ...] = ("x", "y", "z", "intensity"),
+    names: tuple[str, ...] = ("x", "y", "z", "intensity"),
 ) -> bytes:  # fmt: skip
-    """CLOUD as .ply, with a body in place of its own, and properties of these names."""
+    """CLOUD as .ply, with properties of these names."""
     data = ply_of(fields_of(CLOUD), encoding, after=after)
     header, end, own = data.partition(b"\nend_header\n")
     for old, new in zip(("x", "y", "z", "intensity"), names, strict=True):
         header = (header + b"\n").replace(f" {old}\n".encode(), f" ?{new}\n".encode(), 1)[:-1]
-    return header.replace(b" ?", b" ") + end + (own if body is None else body)
+    return header.replace(b" ?", b" ") + end + own

@@ -10,20 +10,17 @@ from calibgraph import Camera, Dataset, Intrinsics, Rig
 from calibgraph.matching.camera_pairs import match_cameras, overlapping_pairs, with_surfaces
 from calibgraph.matching.camera_pairs.find import detect_features
 from calibgraph.matching.camera_pairs.geometry import (
-    MAX_LOG10_FALSE_ALARMS,
     NEIGHBOURS,
     agree_on_epipolar_geometry,
-    log10_false_alarms,
     planes_at,
 )
 from calibgraph.model.camera_matches import CameraMatches
-from calibgraph.model.geometry import inverse_ranges, invert, planes_in_lidar, transform
+from calibgraph.model.geometry import transform
 from calibgraph.simulation.rigs import rig_of
 from calibgraph.solver.pair_refinement import fit_pair
 from calibgraph.solver.pairs import pair_terms
 from factors import pose_sigmas, unproject
 from tests.conftest import SAMPLE, make_camera
-from tests.draws.cameras import FORWARD
 
 
 @pytest.fixture(scope="module")
@@ -182,15 +179,6 @@ def test_random_matches_agree_on_nothing(cameras: tuple[Camera, Camera], count: 
         assert len(agrees) == count
 
 
-def test_the_number_of_false_alarms_is_an_upper_bound() -> None:
-    """Of residuals that are uniform over the image height, none of 2000 draws is accepted."""
-    rng = np.random.default_rng(0)
-    alarms = [
-        log10_false_alarms(rng.uniform(0, 376, 100), (NARROW, NARROW))[0] for _ in range(2000)
-    ]
-    assert min(alarms) > MAX_LOG10_FALSE_ALARMS
-
-
 Array = np.ndarray
 
 
@@ -239,29 +227,3 @@ def test_there_is_none_where_points_are_far_few_or_to_one_side() -> None:
     assert np.isnan(planes_at(inside, cloud[: NEIGHBOURS - 1])).all()
     assert planes_at(np.empty((0, 3)), cloud).shape == (0, 3)
     assert np.isnan(planes_at(inside, np.empty((0, 3)))).all()
-
-
-def test_noise_averages_out() -> None:
-    rng = np.random.default_rng(1)
-    rays = directions(np.arange(-20, 20, 1.1), np.arange(-8, -1, 1.1))
-    cloud = on_plane(SCAN, np.array([0, 0, 0.05]))
-    cloud *= 1 + rng.normal(0, 0.02, (len(cloud), 1)) / np.linalg.norm(cloud, axis=1, keepdims=True)
-    found = planes_at(rays, cloud)
-    ranges, expected = 1 / (rays * found).sum(axis=1), 20 / rays[:, 2]
-    assert np.isfinite(ranges).all()
-    # 2 cm over 24 neighbours with falling weights: 0.5 cm, and 4 sigma of it for 200 features.
-    assert np.abs(ranges - expected).max() < 0.03
-
-
-def test_planes_move_between_frames_with_their_points() -> None:
-    T_camera_lidar = transform(FORWARD, [0.1, -0.3, 0.2])
-    g = np.array([[0.1, 0.3, 0.05]])
-    points = on_plane(SCAN, g[0])
-    in_lidar = (invert(T_camera_lidar) @ np.column_stack([points, np.ones(len(points))]).T)[:3].T
-    planes = planes_in_lidar(g, T_camera_lidar)
-    assert in_lidar @ planes[0] == pytest.approx(np.ones(len(points)))
-    distance = np.linalg.norm(points, axis=1)
-    inverse = inverse_ranges(
-        points / distance[:, None], np.repeat(planes, len(points), 0), T_camera_lidar
-    )
-    assert inverse == pytest.approx(1 / distance)

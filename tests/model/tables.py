@@ -6,9 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from calibgraph import (
-    Correspondences,
-)
+from calibgraph import Correspondences
 from calibgraph.model.camera_matches import CameraMatches
 
 to_arrow = Correspondences.to_arrow

@@ -228,6 +228,7 @@ def test_cameras_that_are_too_far_apart_are_named() -> None:
     assert line.startswith("front_left is 54 m from left: lengths in millimetres or centimetres?")
 
 
+@pytest.mark.realdata
 def test_no_camera_of_real_rigs_is_named(realdata: Path) -> None:
     rigs = [*realdata.glob("*/rig.yaml"), *realdata.glob("kitti_odometry/sequences/*")]
     assert len(rigs) > 10

@@ -17,13 +17,7 @@ from calibgraph.model.error_sources import (
     ErrorSources,
 )
 from calibgraph.model.summary import LEAST, summarize
-from calibgraph.model.verdict import (
-    ErrorProbability,
-    Threshold,
-    beside,
-    in_unit,
-    rig_verdict,
-)
+from calibgraph.model.verdict import ErrorProbability, Threshold, beside, in_unit, rig_verdict
 from calibgraph.trust.thresholds import threshold
 
 

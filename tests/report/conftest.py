@@ -6,21 +6,18 @@ import pytest
 
 import calibgraph
 from calibgraph import Calibration, MatcherErrors, Rig, perturb, simulate_correspondences
-from calibgraph.model.config import Terms
 from calibgraph.report.html import write_report
 from tests.conftest import CommandRun, make_pair
 
 MAX_CHARACTERS = 6_000_000
 
 
-def solve_simulated(
-    rig: Rig, *, frames: int = 8, outlier_share: float = 0.15, terms: Terms = "full"
-) -> Calibration:
+def solve_simulated(rig: Rig, *, outlier_share: float = 0.15) -> Calibration:
     """A result of a simulated table, from 2 degrees and 0.2 m off."""
     errors = MatcherErrors(noise_px=1.0, outlier_share=outlier_share)
-    table = simulate_correspondences(rig, frames=frames, matches=200, errors=errors)
+    table = simulate_correspondences(rig, frames=8, matches=200, errors=errors)
     guess = perturb(rig, rotation_deg=2, translation_m=0.2)
-    return replace(calibgraph.solve(guess, table, terms=terms), correspondences=table)
+    return replace(calibgraph.solve(guess, table), correspondences=table)
 
 
 def write_page(result: Calibration, folder: Path) -> str:

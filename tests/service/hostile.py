@@ -1,22 +1,13 @@
-"""Uploads that want to harm: bombs, paths, lies about sizes, broken files."""
+"""Uploads that want to harm: bombs, paths, lies about sizes."""
 
 import io
 import json
-import pickle
 import struct
 import zipfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
-import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
-
 from tests.conftest import SAMPLE
-from tests.io.test_frames import png
-
-_CAMERA = "front_left"
-_HUGE_PX = 60_000
 
 
 @dataclass(frozen=True)
@@ -31,36 +22,9 @@ class Hostile:
     is_harmless: bool = False  # the job does what was asked for
 
 
-def hostile_uploads(rig: bytes) -> list[Hostile]:
-    """All of them; YAML bombs, more broken tables and bags are in the tests of their readers."""
-    return [*_parts(rig), *_names(), *_archives(), *_recordings()]
-
-
-def _parts(rig: bytes) -> Iterator[Hostile]:
-    names = pa.DictionaryArray.from_arrays(pa.array(np.zeros(10**7, np.int8)), ["l"])
-    pq.write_table(pa.table({"camera": names}), bomb := io.BytesIO())
-    contents = {
-        "python object": ("rig", b"a: !!python/object/apply:os.system ['true']\n"),
-        "control characters": ("rig", rig + b"\x00\x1b[2J"),
-        "huge image": ("rig", rig.replace(b"width_px: 1240", b"width_px: 1e300")),
-        "zip for a rig": ("rig", zipped({"rig.yaml": rig})),
-        "empty rig": ("rig", b""),
-        "bomb of one column": ("correspondences", bomb.getvalue()),
-        "mark alone": ("correspondences", b"PAR1PAR1"),
-        "CSV of one line": ("correspondences", b"a" * 20_000_000),
-        "CSV of a million columns": ("correspondences", b"," * 1_000_000),
-        "pickle": ("correspondences", pickle.dumps({"a": 1})),
-    }
-    for name, (part, content) in contents.items():
-        yield Hostile(name, "solve", {part: content})
-    settings = {
-        "deep settings": "[" * 100_000,
-        "NaN": '{"config": {"seed": NaN}}',
-        "number of 6000 digits": '{"config": {"seed": ' + "9" * 6000 + "}}",
-        "megabytes": " " * 1_100_000,
-    }
-    for name, text in settings.items():
-        yield Hostile(name, "solve", fields={"settings": text})
+def hostile_uploads() -> list[Hostile]:
+    """All of them; other broken files are in the tests of their readers."""
+    return [*_names(), *_archives()]
 
 
 def _names() -> Iterator[Hostile]:
@@ -98,27 +62,6 @@ def _archives() -> Iterator[Hostile]:
     }
     for name, content in contents.items():
         yield Hostile(f"archive: {name}", "calibrate", {"recording": content})
-
-
-def _recordings() -> Iterator[Hostile]:
-    image = f"cameras/{_CAMERA}/000000.jpg"
-    bomb = png(_HUGE_PX, _HUGE_PX, bytes(_HUGE_PX * 100))  # kilobytes for 3.6 gigapixels
-    good = _dataset()
-    without = {name: content for name, content in good.items() if name != image}
-    header = b"{'descr': '<f8', 'fortran_order': False, 'shape': (9000000000, 4), }"
-    huge = b"\x93NUMPY\x01\x00" + struct.pack("<H", 118) + header.ljust(117) + b"\n" + bytes(64)
-    contents = {
-        "image bomb": zipped({**without, f"cameras/{_CAMERA}/000000.png": bomb}),
-        "SVG for an image": zipped({**good, image: b"<svg onload='alert(1)'/>"}),
-        "cloud of 288 GB": zipped({**good, "lidar/000000.npy": huge}),
-        "ROS 1 with a huge record": b"#ROSBAG V2.0\n" + struct.pack("<I", 2**31 - 1) + bytes(50),
-        "MCAP with a huge record": b"\x89MCAP0\r\n\x01" + struct.pack("<Q", 2**62) + bytes(50),
-        "SQLite of garbage": b"SQLite format 3\0" + bytes(range(256)) * 20,
-        "an executable": b"\x7fELF" + bytes(100),
-        "nothing": b"",
-    }
-    for name, content in contents.items():
-        yield Hostile(f"recording: {name}", "calibrate", {"recording": content})
 
 
 def _dataset() -> dict[str, bytes]:

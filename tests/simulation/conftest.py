@@ -25,11 +25,11 @@ SCAN = replace(lidar_of(16), azimuth_step_deg=1.0)
 """A coarse LiDAR."""
 
 
-def small_camera(lens: str, position_m: tuple[float, float, float] = (0.3, 0.2, -0.3)) -> Camera:
+def small_camera(lens: str) -> Camera:
     focal = FOCAL_PX.get(lens, 62.0)  # 120 px from the centre: 39 degrees, fisheye 107
     intrinsics = Intrinsics(fx=focal, fy=focal + 1, cx=121.3, cy=73.8)
     model = "pinhole" if lens == "radtan" else lens
-    return camera_at((240, 150), intrinsics, position_m, model=model, distortion=LENSES[lens])
+    return camera_at((240, 150), intrinsics, (0.3, 0.2, -0.3), model=model, distortion=LENSES[lens])
 
 
 @pytest.fixture(scope="session")

@@ -5,16 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibgraph.simulation.lidar import (
-    lidar_of,
-    return_chance,
-    scan,
-    shot_directions,
-)
+from calibgraph.simulation.lidar import lidar_of, return_chance, scan, shot_directions
 from calibgraph.simulation.recording import Drive
-from calibgraph.simulation.world import Hits, cast, find_albedos
+from calibgraph.simulation.world import cast, find_albedos
 from tests.simulation.conftest import SCAN
-from tools.scenes.scan_errors import ScanErrors, foremost
+from tools.scenes.scan_errors import ScanErrors
 
 pytestmark = pytest.mark.usefixtures("open3d")
 
@@ -65,8 +60,8 @@ def test_32_beams_cover_a_sector_and_the_others_a_full_turn() -> None:
 EXACT = replace(SCAN, range_noise_m=0.0, dropout=0.0)
 
 
-def scanned(drive: Drive, errors: ScanErrors, frame: int = 0) -> np.ndarray:
-    T, rng = drive.T_world_lidar[frame], np.random.default_rng(1)
+def scanned(drive: Drive, errors: ScanErrors) -> np.ndarray:
+    T, rng = drive.T_world_lidar[0], np.random.default_rng(1)
     return scan(drive.world, replace(EXACT, errors=errors), np.ones(16), T, rng=rng).astype(float)
 
 
@@ -97,31 +92,3 @@ def test_a_moving_sensor_is_behind_when_it_looks_right_and_ahead_when_left(drive
     ranges = np.linalg.norm(whole[:, :3], axis=1)
     rays = (whole[:, :3] / ranges[:, None] @ T[:3, :3].T).astype(np.float32)
     assert np.mean(np.abs(cast(drive.world, origins, rays).distance_m - ranges) < 0.02) > 0.98
-
-
-def hits(*distances: float) -> list[Hits]:
-    """Of one shot of seven rays."""
-    one = np.zeros((1, 2), np.float32)
-    return [
-        Hits(np.array([d], np.float32), np.array([k], np.int32), one)
-        for k, d in enumerate(distances)
-    ]
-
-
-def test_of_a_wide_beam_the_foremost_surface_returns_that_two_parts_meet() -> None:
-    both = foremost(hits(20.0, 10.0, 10.1, 20.0, 20.1, 20.0, 20.0))
-    assert both.distance_m[0] == pytest.approx(10.05) and both.triangle[0] in {1, 2}
-    one = foremost(hits(20.0, 10.0, 20.1, 20.0, 20.1, 20.0, 20.0))
-    assert one.distance_m[0] == pytest.approx(20.03, abs=0.01)
-    slanted = foremost(hits(10.0, 10.4, 10.8, 11.2, 11.6, 12.0, 12.4))
-    assert slanted.distance_m[0] == pytest.approx(11.2)
-    sky = foremost(hits(*[np.inf] * 7))
-    assert np.isinf(sky.distance_m[0])
-    edge = foremost(hits(np.inf, 10.0, 10.0, *[np.inf] * 4))
-    assert edge.distance_m[0] == pytest.approx(10.0)
-
-
-def test_wrong_errors_are_refused() -> None:
-    three = ScanErrors(elevations_deg=(0.1, 0.0, 0.1))
-    with pytest.raises(ValueError, match="errors of 3 elevations for 16 beams"):
-        replace(lidar_of(16), errors=three)

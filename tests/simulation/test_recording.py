@@ -20,8 +20,12 @@ pytestmark = pytest.mark.usefixtures("open3d")
 
 
 @pytest.mark.parametrize(
-    ("surroundings", "vary_layout"), [("street", False), *((name, True) for name in SURROUNDINGS)]
-)
+    ("surroundings", "vary_layout"),
+    [
+        ("street", False), ("street", True),
+        *(pytest.param(name, True, marks=pytest.mark.slow) for name in [*SURROUNDINGS][1:]),
+    ],
+)  # fmt: skip
 def test_stops_are_apart_and_the_lane_is_free(surroundings: str, vary_layout: bool) -> None:
     scene = SURROUNDINGS[surroundings]
     drive = build_drive(frames=6, step_m=5.0, seed=2, vary_layout=vary_layout, build_scene=scene)

@@ -49,9 +49,3 @@ def linearized(model: LatentPoseModel, values: gtsam.Values) -> Linearization:
         shared.erase(key)
     inverses = np.array([[to_T_camera_lidar(pose) for pose in row] for row in poses])
     return Linearization(model, shared, inverses)
-
-
-def place_keys(model: LatentPoseModel) -> list[int]:
-    """Keys of all ``a_cp`` and ``o_p``."""
-    matched = [matched_at_key(place, camera) for place, camera in model.matched_places]
-    return [*matched, *map(cloud_at_key, range(model.places))]

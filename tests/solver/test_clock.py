@@ -7,13 +7,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from calibgraph import (
-    Config,
-    Rig,
-    load_calibration,
-    load_correspondences,
-    solve,
-)
+from calibgraph import Config, Rig, load_calibration, load_correspondences, solve
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.error_sources import MOTION
 from calibgraph.model.geometry import twist_between

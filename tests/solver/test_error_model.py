@@ -3,7 +3,6 @@
 from dataclasses import replace
 from typing import Any
 
-import gtsam
 import numpy as np
 import pytest
 
@@ -16,34 +15,17 @@ from calibgraph import (
     solve,
 )
 from calibgraph.graph.components import VarianceRatios
-from calibgraph.graph.latent_poses import data_graph, latent_pose_graph, to_ordering
-from calibgraph.graph.variables import DISTORTION
 from calibgraph.model.config import Config, preset
 from calibgraph.model.error_sources import COMMON, MATCHES, MOST_TIMES
 from calibgraph.model.findings import MatcherFindings, error_components
-from calibgraph.model.geometry import to_T_lidar_camera
 from calibgraph.model.verdict import COMMON_ERROR
 from calibgraph.simulation.correspondences import PoseSpread
-from calibgraph.solver.covariance import with_pseudo_frames
 from calibgraph.solver.error_model import fit_errors
 from calibgraph.solver.joint import solve_joint
-from calibgraph.solver.matches import camera_blocks
-from calibgraph.solver.pair_refinement import (
-    PairFit,
-    fit_pairs,
-    place_pairs,
-    shared_variance_ratio,
-)
-from calibgraph.solver.pairs import pair_terms
 from calibgraph.solver.places import ErrorFit
-from calibgraph.solver.robust import ResidualScale
-from calibgraph.solver.sources import variances_by_source
-from calibgraph.solver.within_place import block_by_place
 from calibgraph.trust.evidence import Evidence
-from factors import pose_sigmas
 from tests.draws.lenses import with_known_lenses
 from tests.draws.places import displaced
-from tests.solver.latent import all_values, place_keys, reported_keys
 from tests.solver.test_camera_pairs import simulated_pairs
 
 ZERO = {"systematic_rotation_rad": 0.0, "systematic_translation_m": 0.0}
@@ -101,21 +83,6 @@ def test_simulated_matchers_state_it_where_they_have_none(pair: Rig) -> None:
         assert kept.states_common_error == states
 
 
-def test_few_frames_add_what_is_usual_and_many_keep_their_own_scatter() -> None:
-    """The gradient of one frame is zero at the solution; of ten, pseudo frames add a diagonal."""
-    rng, hessian = np.random.default_rng(0), np.diag([4.0, 3.0, 2.0, 1.0])
-    usual = np.diag([9.0, 8.0, 7.0, 6.0])
-    found = with_pseudo_frames(np.zeros((4, 4)), hessian, 1.0, usual)
-    np.testing.assert_allclose(found, usual)
-    few, many = (rng.standard_normal((frames, 4)) for frames in (10, 4000))
-    scatter = few.T @ few
-    found = with_pseudo_frames(scatter, hessian, 10.0)
-    np.testing.assert_allclose(found, scatter + 6 / 9 * np.diag(np.diag(scatter)))
-    scatter = many.T @ many
-    found = with_pseudo_frames(scatter, hessian, 4000.0, 100 * scatter)
-    np.testing.assert_allclose(found, scatter, rtol=0.02, atol=0.02 * scatter[0, 0])
-
-
 SHARED_RAD, SHARED_M = np.radians(0.09), 0.02
 STATED: dict[str, Any] = {
     "systematic_rotation_rad": float(SHARED_RAD),
@@ -154,55 +121,6 @@ def test_what_all_frames_share_is_the_share_that_its_size_has(pair: Rig, config:
     assert found.rotation[COMMON] > 0.5 > found.rotation[MATCHES] > 0
 
 
-def test_the_shares_are_those_of_independent_errors_and_add_up(pair: Rig) -> None:
-    """The part that is left to the matches is the one that their own equations give."""
-    errors = evidence(pair, table_of_places(pair, 3, OF_A_SENSOR)).solution.error_fit
-    parts = variances_by_source(errors)
-    whole = np.diag(errors.covariance)  # of which the matches are 3e-4 to 7e-3
-    np.testing.assert_allclose((sum(parts.values()) + of_matches(errors)) / whole, 1, atol=1e-8)
-
-
-def of_matches(errors: ErrorFit) -> np.ndarray:
-    """(6 N,) variances by the data, by the residuals of the distortion, and by the scatter.
-
-    From the dense covariance C: C G C, with G the information of each of these.
-    """
-    linear = errors.linear
-    weight, values, parts = linear.ties.weight.T, all_values(linear), errors.model.components
-    cameras = weight[:, 1:, None, None]
-    parts = replace(
-        parts,
-        cloud_at_place=parts.cloud_at_place / weight[:, 0, None, None],
-        at_place=parts.at_place / cameras,
-        scatter_at_place=parts.scatter_at_place / cameras,
-        robust_scale=np.inf,
-    )
-    model = replace(errors.model, components=parts)
-    reported = reported_keys(errors)
-    order = to_ordering([*reported, *model.columns, *place_keys(model)])
-    starts, end = {}, 0
-    for number in range(order.size()):
-        starts[order.at(number)] = end
-        end += 3 if order.at(number) == DISTORTION else 6
-    graph, data = (of(model).linearize(values) for of in (latent_pose_graph, data_graph))
-    moved = np.linalg.inv(graph.hessian(order)[0])[: 6 * len(model.cameras)]
-    information = np.zeros((end, end))
-    for number in range(data.size()):
-        factor = data.at(number)
-        rows = np.concatenate([starts[key] + np.arange(6) for key in list(factor.keys())])
-        information[np.ix_(rows, rows)] += factor.information()
-    rows = starts[DISTORTION] + np.arange(3)
-    information[np.ix_(rows, rows)] += parts.distortion_information
-    for number, (place, camera) in enumerate(model.matched_places):
-        edge = model.place_graph.at(model.places + number)
-        root = edge.noiseModel().R()
-        whitened, _ = edge.linearize(values).jacobian()
-        rows = np.concatenate([starts[key] + np.arange(6) for key in list(edge.keys())])
-        scatter = root @ parts.scatter_at_place[place, camera] @ root.T
-        information[np.ix_(rows, rows)] += whitened.T @ scatter @ whitened
-    return np.diag(moved @ information @ moved.T)
-
-
 def test_the_error_bar_of_more_frames_is_as_predicted(pair: Rig) -> None:
     few = evidence(pair, table_of_places(pair, 5, OF_A_SENSOR)).error_sources
     many = evidence(pair, table_of_places(pair, 25, OF_A_SENSOR)).error_sources
@@ -224,41 +142,6 @@ def test_recording_is_advised_only_where_it_shrinks_the_error_bar_enough(pair: R
     limited = found.action((0.9 * best_deg / 0.3, 100.0))
     assert "Record" not in limited and limited.startswith("Tolerate more")
     assert f"{best_deg:.2g} deg" in limited
-
-
-EACH = pose_sigmas(rotation_rad=2e-3, translation_m=0.03) ** 2
-
-
-@pytest.mark.parametrize("size", [2.0, 4.0])
-def test_its_size_is_found_from_what_cameras_see_in_common(mixed_rig: Rig, size: float) -> None:
-    """Cameras displaced at random by so many times their covariance, images that are exact."""
-    rng = np.random.default_rng(0)
-    covariance = np.diag(np.tile(EACH, 3))
-    fits, found = fits_of(mixed_rig), []
-    for _ in range(200):
-        own = {
-            name: gtsam.Pose3.Expmap(size * np.sqrt(EACH) * rng.standard_normal(6)).matrix() @ T
-            for name, T in mixed_rig.T_camera_lidar.items()
-        }
-        found.append(shared_variance_ratio(own, covariance, fits))
-    # Two of the three cameras are tied: six degrees of freedom, and six of what is usual.
-    expected = (6 + 6 * size**2) / 12
-    spread = 6 * size**2 * np.sqrt(2 / 6) / 12 / np.sqrt(200)
-    assert np.mean(found) == pytest.approx(expected, rel=0.05, abs=4 * spread)
-
-
-def fits_of(rig: Rig) -> list[PairFit]:
-    """Where exact images place the cameras."""
-    held = np.array([np.diag(EACH)] * len(rig.cameras))
-    terms = pair_terms(rig, simulated_pairs(rig))
-    T = rig.T_camera_lidar
-    return fit_pairs(terms, T, held, place_pairs(terms, T))
-
-
-def test_it_is_never_taken_for_less_than_usual_and_as_usual_without_tied_cameras(pair: Rig) -> None:
-    covariance = np.diag(np.tile(EACH, 2))
-    for fits in (fits_of(pair), ()):
-        assert shared_variance_ratio(pair.T_camera_lidar, covariance, fits) == 1.0
 
 
 def test_a_displaced_camera_widens_the_error_bars(pair: Rig) -> None:
@@ -325,27 +208,3 @@ def test_few_places_are_never_taken_for_better_than_usual_and_one_says_nothing(p
     """At one place nothing is measured twice, so nothing is learnt, whatever the error."""
     for places, size in ((4, 0.0), (1, 25.0)):
         assert errors_of(pair, table_of(pair, places, size, 0)).ratios == VarianceRatios()
-
-
-def test_a_larger_variance_and_a_smaller_weight_divide_the_sums(pair: Rig) -> None:
-    """Of matches with information of their own; the loss bends at the same pixels."""
-    table = simulate_correspondences(pair, frames=2, matches=50, errors=MatcherErrors(noise_px=1.0))
-    stretched = np.tile([0.5, 0.1, 2.0], (len(table), 1))
-    table = replace(table, information_px=stretched)
-    blocks = camera_blocks(pair, table, Config())
-    for name, T in pair.T_camera_lidar.items():
-        block, pose = blocks[name], to_T_lidar_camera(T)
-        scale = ResidualScale(1.0, 3.0, 9.0, 1.0)
-        placed = block_by_place(block, scale, [np.arange(2)])
-        one, two = (
-            each.sums(T[None])
-            for each in (placed, replace(placed, block=placed.block.with_variance(4.0)))
-        )
-        for part in ("hessian", "gradient", "cost"):
-            np.testing.assert_allclose(getattr(two, part), getattr(one, part) / 4, rtol=1e-12)
-        quadratic = replace(scale, loss_scale=1e6)
-        all_of_it, light = (
-            each.with_scale(quadratic).sums(pose).hessian
-            for each in (block, block.with_weights(np.full(len(block), 0.25)))
-        )
-        np.testing.assert_allclose(light, all_of_it / 4, rtol=1e-6)

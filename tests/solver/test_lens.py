@@ -7,13 +7,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from calibgraph import (
-    Config,
-    MatcherErrors,
-    Rig,
-    simulate_correspondences,
-    solve,
-)
+from calibgraph import Config, MatcherErrors, Rig, simulate_correspondences, solve
 from calibgraph.graph.latent_poses import latent_pose_graph
 from calibgraph.graph.lens import LensVariable
 from calibgraph.graph.variables import lens_key
@@ -142,18 +136,6 @@ def test_of_a_lens_an_alignment_errs_by_what_other_scenes_show_and_a_mount_by_al
         )
         shares = mounts[1].error_sources(mounts[1].covariance)[name].translation
         assert shares["uncertain lenses and clocks"] > 0.9
-
-
-def test_the_covariance_of_a_mount_is_that_of_its_graph(drawn: Drawn) -> None:
-    truth, table = drawn
-    found = solve_joint(truth, table, Config(of="mount"))
-    fit = found.error_fit
-    marginals = gtsam.Marginals(found.graph(), all_values(fit.linear))
-    for number in range(len(truth.cameras)):
-        rows = slice(6 * number, 6 * number + 6)
-        own = marginals.marginalCovariance(reported_keys(fit)[number]) + fit.by_lenses[rows, rows]
-        sigmas = np.sqrt(np.diag(found.covariance[rows, rows]))
-        np.testing.assert_allclose(np.sqrt(np.diag(own)), sigmas, rtol=1e-3)
 
 
 def test_estimate_and_sigma_are_those_of_the_whole_graph(drawn: Drawn) -> None:

@@ -7,14 +7,8 @@ import gtsam
 import numpy as np
 import pytest
 
-from calibgraph import (
-    Config,
-    Correspondences,
-    MatcherErrors,
-    Rig,
-    simulate_correspondences,
-)
-from calibgraph.graph.components import EXACT, VarianceComponents
+from calibgraph import Config, Correspondences, MatcherErrors, Rig, simulate_correspondences
+from calibgraph.graph.components import EXACT
 from calibgraph.graph.latent_poses import LatentPoseModel, latent_pose_graph
 from calibgraph.graph.variables import (
     DISTORTION,
@@ -28,9 +22,7 @@ from calibgraph.solver.error_model import fit_errors
 from calibgraph.solver.joint import solve_joint
 from calibgraph.solver.pairs import pair_terms
 from calibgraph.solver.places import ErrorFit, fit_latent_poses, start_values
-from factors import ProjectionBlock
 from tests.conftest import stereo_relative_pose
-from tests.draws.lenses import with_known_lenses
 from tests.solver.latent import all_values, linearized, reported_keys
 from tests.solver.test_camera_pairs import simulated_pairs
 
@@ -202,46 +194,6 @@ def test_matches_of_one_place_decide_by_themselves(pair: Rig) -> None:
     errors = fit_errors(solution.fitted, table.findings, table.places)
     for name, T in errors.T_camera_lidar.items():
         np.testing.assert_allclose(T, solution.T_camera_lidar[name], rtol=0, atol=1e-7)
-
-
-def test_a_continued_fit_is_that_of_its_start(pair: Rig) -> None:
-    """The data that it has linearized hold for other components and another pose graph."""
-    errors = solve_model(tie(pair), table_of(pair, 8, False, PLACES["four"]), pairs=True)
-    other = replace(with_correlations(errors.model), pose_graph=gtsam.NonlinearFactorGraph())
-    for model in (errors.model, other):
-        starts = errors.linear, linearized(model, all_values(errors.linear))
-        found, expected = (fit_latent_poses(model, start) for start in starts)
-        for name, T in found.T_camera_lidar.items():
-            np.testing.assert_allclose(T, expected.T_camera_lidar[name], rtol=0, atol=1e-12)
-        # Exact ties have 1e10 of information, beside 1e5 of the matches: 1e-16 of it counts.
-        np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-8, atol=1e-13)
-
-
-def test_of_one_camera_and_place_the_covariance_is_the_sum_of_all_parts(pair: Rig) -> None:
-    """Of what is stated, of the scatter of frames, and of independent matches."""
-    table = table_of(pair, 8, False, [])
-    metadata = {**table.metadata, "place_variance": 0.0}
-    errors = solve_model(with_known_lenses(pair), replace(table, metadata=metadata), pairs=False)
-    parts, Ad = errors.model.components, gtsam.Pose3(errors.T_camera_lidar["left"]).AdjointMap()
-    cloud = parts.cloud + parts.cloud_at_place
-    block = errors.model.blocks["left"]
-    assert isinstance(block.block, ProjectionBlock)
-    hessian = block.sums(errors.T_camera_lidar["left"][None]).hessian[0]
-    aligned = parts.camera + Ad @ cloud @ Ad.T + parts.at_place[0, 0] + np.linalg.inv(hessian)
-    mount = aligned + with_distortion(parts)
-    for fit, expected in ((errors, aligned), (errors.of_mount, mount)):
-        sigmas = np.sqrt(np.diag(expected))
-        difference = (fit.covariance[:6, :6] - expected) / np.outer(sigmas, sigmas)
-        # The paper's priors of a metre take (3 cm / 1 m)^2 off.
-        assert np.abs(difference).max() < 2e-3
-
-
-def with_distortion(parts: VarianceComponents) -> np.ndarray:
-    """(6, 6) covariance of the first camera's matches by the scan distortion."""
-    shown = parts.distortion_information
-    covariance = np.linalg.inv(np.eye(len(shown)) / parts.distortion_size + shown)
-    jacobian = parts.distortion_jacobian[0]
-    return np.asarray(jacobian @ covariance @ jacobian.T)
 
 
 def test_data_that_determine_far_less_than_exact_ties_have_an_error_bar(pair: Rig) -> None:

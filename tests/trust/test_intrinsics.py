@@ -4,25 +4,10 @@ import re
 
 import pytest
 
-from calibgraph import Camera, Config, Correspondences, Rig, solve
+from calibgraph import Config, Correspondences, Rig, solve
 from calibgraph.model.lens import IN_DOUBT, LensSigmas
+from tests.draws.lenses import put_lens_error
 from tests.trust.conftest import named, simulated
-
-
-def with_lens(rig: Rig, distortion: tuple[float, ...] = (), **changes: float) -> Rig:
-    """The rig with intrinsics multiplied (fx, fy) or shifted (cx, cy)."""
-    cameras = {}
-    for name, camera in rig.cameras.items():
-        k = camera.intrinsics_px
-        lens = {
-            "fx": k.fx * changes.get("focal", 1.0),
-            "fy": k.fy * changes.get("focal", 1.0) * changes.get("fy", 1.0),
-            "cx": k.cx + changes.get("cx", 0.0),
-            "cy": k.cy,
-        }
-        given = {**camera.model_dump(), "intrinsics_px": lens}
-        cameras[name] = Camera.model_validate({**given, "distortion": distortion})
-    return rig.model_copy(update={"cameras": cameras})
 
 
 def test_right_intrinsics_pass(mixed_rig: Rig) -> None:
@@ -34,7 +19,7 @@ def test_right_intrinsics_pass(mixed_rig: Rig) -> None:
 
 @pytest.mark.parametrize("factor", [0.95, 1.03])
 def test_a_wrong_focal_length_fails_and_is_measured(pair: Rig, factor: float) -> None:
-    result = solve(with_lens(pair, focal=factor), simulated(pair))
+    result = solve(put_lens_error(pair, "focal", factor - 1), simulated(pair))
     (check,) = named(result, "left", "a focal length")[:1]
     assert check.status == "FAIL"
     words = "shorter" if factor > 1 else "longer"
@@ -44,21 +29,21 @@ def test_a_wrong_focal_length_fails_and_is_measured(pair: Rig, factor: float) ->
     assert percent == pytest.approx(100 * abs(1 / factor - 1), rel=0.1)
 
 
-@pytest.mark.parametrize("factor", [0.96, 1.04])
-def test_a_wrong_fy_alone_is_no_pass_and_is_named(pair: Rig, factor: float) -> None:
-    result = solve(with_lens(pair, fy=factor), simulated(pair))
+@pytest.mark.parametrize("error", [-0.04, 0.04])
+def test_a_wrong_ratio_alone_is_no_pass_and_is_named(pair: Rig, error: float) -> None:
+    result = solve(put_lens_error(pair, "aspect", error), simulated(pair))
     (check,) = named(result, "left", "a ratio fx / fy")
     assert check.status != "PASS"
-    assert ("larger" if factor > 1 else "smaller") in check.text
+    assert ("larger" if error < 0 else "smaller") in check.text
 
 
 def test_images_undistorted_twice_fail(pair: Rig) -> None:
-    result = solve(with_lens(pair, distortion=(-0.2, 0.0, 0.0, 0.0)), simulated(pair))
+    result = solve(put_lens_error(pair, "distortion", -0.2), simulated(pair))
     assert named(result, "left", "a k1 ")[0].status == "FAIL"
 
 
 def test_a_shifted_principal_point_fails_and_is_measured(pair: Rig) -> None:
-    result = solve(with_lens(pair, cx=20.0), simulated(pair))
+    result = solve(put_lens_error(pair, "centre", 20.0), simulated(pair))
     (check,) = named(result, "left", "principal point")
     assert check.status == "FAIL"  # it turns the camera by a degree
     (found,) = re.findall(r"off by \((-[0-9.]+) ", check.text)

@@ -7,14 +7,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 
-from calibgraph import (
-    IncrementalCalibrator,
-    Intrinsics,
-    MatcherErrors,
-    Rig,
-    Update,
-    perturb,
-)
+from calibgraph import IncrementalCalibrator, Intrinsics, MatcherErrors, Rig, Update, perturb
 from calibgraph.model.geometry import invert
 from factors.pose_kernel import logarithms
 from tests.draws.cameras import camera_at

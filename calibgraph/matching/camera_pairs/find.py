@@ -171,8 +171,7 @@ def overlapping_pairs(rig: Rig, cloud: NDArray[np.float32]) -> list[tuple[str, s
 
 def _in_widened_image(camera: Camera, points: Array) -> NDArray[np.bool_]:
     """(n,) the points that project into the image or its margin."""
-    T = camera.T_camera_lidar
-    pixels, valid = camera.lens.project(points @ T[:3, :3].T + T[:3, 3])
+    pixels, valid = camera.lens.project(points, camera.T_camera_lidar)
     size = np.array([camera.width_px, camera.height_px])
     shares = (pixels + 0.5) / size
     return np.asarray(valid & (shares > -_MARGIN).all(axis=1) & (shares < 1 + _MARGIN).all(axis=1))

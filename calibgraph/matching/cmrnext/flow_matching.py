@@ -5,6 +5,7 @@ match, 0 to 1, is a product of three factors: convergence, correlation peak, and
 frame's pose. It ranks matches, but is not calibrated: it is no probability.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -164,16 +165,16 @@ class ImageResult:
         matches: of the last network.
         T_camera_lidar: (4, 4) estimated from them by PnP; None if that failed.
         failed: whether a network gave no pose, or one beyond its range of training.
-        start_dependence: see :mod:`calibgraph.matching.cmrnext.matcher`; None if not measured.
-        memorization: see the same module; None if not measured.
+        start_dependence: see :mod:`calibgraph.matching.cmrnext.matcher`; NaN if not measured.
+        memorization: see the same module; NaN if not measured.
     """
 
     job: MatchingJob
     matches: Correspondences
     T_camera_lidar: Array | None
     failed: bool
-    start_dependence: float | None = None
-    memorization: float | None = None
+    start_dependence: float = math.nan
+    memorization: float = math.nan
 
 
 def to_findings(results: Mapping[str, Sequence[ImageResult]]) -> MatcherFindings:
@@ -187,12 +188,10 @@ def to_findings(results: Mapping[str, Sequence[ImageResult]]) -> MatcherFindings
 
 
 def _medians(results: Mapping[str, Sequence[ImageResult]], attribute: str) -> dict[str, float]:
-    """Median of a probe over the frames of each probed camera; NaN if none could be measured."""
+    """Median of a probe over the frames of each camera; NaN if none could be measured."""
     medians = {}
     for name, of_camera in results.items():
-        measured = [getattr(result, attribute) for result in of_camera]
-        probed = np.array([value for value in measured if value is not None])
-        if len(probed):
-            finite = probed[np.isfinite(probed)]
-            medians[name] = float(np.median(finite)) if len(finite) else float("nan")
+        probed = np.array([getattr(result, attribute) for result in of_camera])
+        finite = probed[np.isfinite(probed)]
+        medians[name] = float(np.median(finite)) if len(finite) else math.nan
     return medians

@@ -173,10 +173,9 @@ def _is_within_range(checkpoint: Checkpoint, job: MatchingJob, T_camera_lidar: A
 
 def _weigh(job: MatchingJob, table: Correspondences, T_camera_lidar: Array) -> Correspondences:
     """The matches with their confidence lowered by their residuals."""
-    points = table.points_lidar_m @ T_camera_lidar[:3, :3].T + T_camera_lidar[:3, 3]
-    projected, valid = job.camera.lens.project(points)
-    residuals = np.linalg.norm(projected - table.pixels_px, axis=1)
-    residuals = np.where(valid, residuals, np.inf)
+    projected, valid = job.camera.lens.project(table.points_lidar_m, T_camera_lidar)
+    apart_px = np.linalg.norm(projected - table.pixels_px, axis=1)
+    residuals = np.where(valid, apart_px, np.inf)
     return replace(table, confidence=lower_by_residuals(table.confidence, residuals))
 
 
@@ -215,9 +214,7 @@ def remaining_share(
         the matches are independent of the start, 1 if they follow it; NaN with too few matches.
     """
     points = matches.points_lidar_m
-    base, start = (
-        camera.lens.project(points @ T[:3, :3].T + T[:3, 3])[0] for T in (T_base, T_displaced)
-    )
+    base, start = (camera.lens.project(points, T)[0] for T in (T_base, T_displaced))
     displacement, remainder = start - base, matches.pixels_px - base
     if len(points) < _MIN_POINTS:
         return float("nan")

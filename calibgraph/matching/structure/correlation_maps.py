@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import cached_property, partial
+from typing import Any
 
 import cv2
 import numpy as np
@@ -18,12 +19,11 @@ from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
 from calibgraph.matching.structure.correlation_kernels import find_best_shifts, sum_z_scores
-from calibgraph.matching.structure.directions import view_angles
+from calibgraph.matching.structure.directions import find_visible, view_angles
 from calibgraph.matching.structure.prepared_cloud import PreparedCloud
 from calibgraph.matching.structure.prepared_image import PreparedImage
-from calibgraph.matching.structure.score_kernel import pad, score_windows
+from calibgraph.matching.structure.score_kernel import LANES, LINES, pad, score_windows
 from calibgraph.matching.structure.shift_scores import group_windows, mean_by_group
-from calibgraph.matching.structure.visibility import find_visible
 from calibgraph.matching.structure.windows import Windows
 from calibgraph.model.rig import Camera
 
@@ -79,9 +79,7 @@ class CorrelationMaps:
         win, such as those far back, or those that see few and only the best.
         """
         out = np.zeros(len(T_camera_lidar))
-        maps, points, T = self.maps, self.points_lidar_m, _to_columns(T_camera_lidar)
-        grid = np.array([*self.origin_rad, self.step_rad])
-        sum_z_scores(maps, self.variances, points, T, grid, self._variance_floor, out)
+        sum_z_scores(*self._given(T_camera_lidar), out)
         return out
 
     def find_best_shifts(
@@ -98,19 +96,19 @@ class CorrelationMaps:
         """
         reach = np.rint(np.array(reach_rad) / self.step_rad).astype(np.int64)
         out = np.zeros((len(T_camera_lidar), 3))
-        maps, points, T = self.maps, self.points_lidar_m, _to_columns(T_camera_lidar)
-        grid = np.array([*self.origin_rad, self.step_rad])
-        find_best_shifts(maps, self.variances, points, T, grid, self._variance_floor, reach, out)
+        find_best_shifts(*self._given(T_camera_lidar), reach, out)
         return out[:, 0], out[:, 1:] * self.step_rad
 
     @property
     def _variance_floor(self) -> float:
         return MIN_VARIANCE_SHARE * float(self.variances.sum()) + 1e-12
 
-
-def _to_columns(T: Array) -> NDArray[np.float32]:
-    """(12, n) the first three rows of transforms (n, 4, 4), a column each."""
-    return np.ascontiguousarray(T[:, :3].reshape(len(T), 12).T, dtype=np.float32)
+    def _given(self, T: Array) -> tuple[Any, ...]:
+        """What both kernels are given; the first three rows of transforms as columns (12, n)."""
+        columns = np.ascontiguousarray(T[:, :3].reshape(len(T), 12).T, dtype=np.float32)
+        grid = np.array([*self.origin_rad, self.step_rad])
+        floor = self._variance_floor
+        return self.maps, self.variances, self.points_lidar_m, columns, grid, floor
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,10 +237,14 @@ def _to_angular_image(image: PreparedImage, camera: Camera) -> _AngularImage:
     seen = (valid & camera.in_image(pixels)).reshape(right.shape)
     rows, columns = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
     part = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-    small, scale = image.log_gray(camera, STEP_RAD, BLUR_STEPS)
+    padded, scale = image.log_gray(camera, STEP_RAD, BLUR_STEPS)
     places = ((pixels.reshape(*right.shape, 2)[part] + 0.5) * scale - 0.5).astype(np.float32)
     remapped = cv2.remap(
-        small, places[..., 0], places[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        padded[:-LINES, :-LANES],
+        places[..., 0],
+        places[..., 1],
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
     )
     origin_rad = np.array([azimuth[columns[0]], elevation[rows[0]]])
     return _AngularImage(np.asarray(remapped, dtype=np.float32), seen[part], origin_rad)

@@ -1,11 +1,14 @@
-"""Directions: view angles of a camera, and one direction per cell of the sphere."""
+"""Directions: angles, one direction per cell of the sphere, and which points a camera sees."""
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.arrays import Array
+from calibgraph.arrays import Array, Mask
+from calibgraph.model.rig import Camera
 
 Rows = NDArray[np.intp]
+
+HIDDEN_RATIO, HIDDEN_M = 1.15, 0.3  # a point farther than this beyond the nearest is hidden
 
 
 def view_angles(points_camera_m: Array) -> Array:
@@ -48,16 +51,69 @@ def thin(angles: Array, cell_rad: float) -> Rows:
     Returns:
         Rows of the directions that are kept, by cell: by rows of cells, and by azimuth.
     """
-    if not len(angles):
-        return np.empty(0, np.intp)
     up = angles[:, 1] / cell_rad
     row = np.floor(up)
     along = (angles[:, 0] + np.pi) * np.cos((row + 0.5) * cell_rad) / cell_rad
-    column = np.floor(along)
-    off = (along - column - 0.5) ** 2 + (up - row - 0.5) ** 2
-    row, column = row - row.min(), column - column.min()
-    cells = (row * (column.max() + 1) + column).astype(np.intp)
-    nearest = np.full(cells.max() + 1, np.inf)
-    np.minimum.at(nearest, cells, off)
-    rows = np.flatnonzero(off == nearest[cells])
+    off = (along - np.floor(along) - 0.5) ** 2 + (up - row - 0.5) ** 2
+    cells, nearest = _nearest_in_cells(np.column_stack([up, along]), off)
+    rows = np.flatnonzero(off == nearest)
     return rows[np.unique(cells[rows], return_index=True)[1]]  # of equally near ones, the first
+
+
+def name_cells(places: Array) -> NDArray[np.int64]:
+    """(n,) a number per cell of places (n, k) on a grid of step 1, in the order of the columns."""
+    cells = np.floor(places).astype(np.int64)
+    if not len(cells):
+        return np.empty(0, np.int64)
+    cells -= cells.min(axis=0)
+    return np.asarray(np.ravel_multi_index(tuple(cells.T), tuple(cells.max(axis=0) + 1)))
+
+
+def _nearest_in_cells(places: Array, distance: Array) -> tuple[NDArray[np.int64], Array]:
+    """The cells of places, as of :func:`name_cells`, and the (n,) least distances in them."""
+    cells = name_cells(places)
+    nearest = np.full(cells.max(initial=0) + 1, np.inf)
+    np.minimum.at(nearest, cells, distance)
+    return cells, nearest[cells]
+
+
+def find_in_view(points_lidar_m: Array, camera: Camera) -> tuple[Rows, Array, Array]:
+    """Find the points that project into a camera's image.
+
+    Args:
+        points_lidar_m: (n, 3) in the LiDAR frame.
+        camera: lens, image size and extrinsic.
+
+    Returns:
+        (k,) their rows; (k, 2) view angles [rad], see :func:`view_angles`; (k,)
+        distances from the camera [m].
+    """
+    T = camera.T_camera_lidar
+    in_camera_m = points_lidar_m @ T[:3, :3].T + T[:3, 3]
+    ahead = np.flatnonzero((in_camera_m[:, 2] > 0) | (camera.model != "pinhole"))
+    pixels, valid = camera.lens.project(in_camera_m[ahead])
+    rows = ahead[valid & camera.in_image(pixels)]
+    return rows, view_angles(in_camera_m[rows]), np.linalg.norm(in_camera_m[rows], axis=1)
+
+
+def find_visible(angles: Array, distance_m: Array, cell_rad: float) -> Mask:
+    """Find the points that no much nearer point of the same cell hides.
+
+    Args:
+        angles: (n, 2) [rad].
+        distance_m: (n,).
+        cell_rad: side of a cell.
+    """
+    _, nearest_m = _nearest_in_cells(
+        (angles - angles.min(axis=0, initial=np.inf)) / cell_rad, distance_m
+    )
+    return np.asarray(distance_m < HIDDEN_RATIO * nearest_m + HIDDEN_M)
+
+
+def find_places(
+    rays_m: NDArray[np.float32], viewpoint_lidar_m: Array, camera: Camera, scale: Array
+) -> NDArray[np.int32]:
+    """(w, l, 2) nearest pixels, of an image scaled by (2,), to the ends of rays (w, l, 3)."""
+    pixels, _ = camera.lens.project(rays_m + viewpoint_lidar_m, camera.T_camera_lidar)
+    pixels = pixels.reshape(*rays_m.shape[:2], 2)
+    return np.rint((pixels + 0.5) * scale - 0.5).astype(np.int32)

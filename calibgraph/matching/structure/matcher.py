@@ -129,11 +129,7 @@ class StructureMatcher:
                 rig, seen, self.search_range, seed=self.seed, out_of_time=out_of_time
             )
             located, findings = Locator(search, pool, progress).locate()
-        findings = replace(
-            findings,
-            range_rotation_deg=self.search_range.rotation_deg,
-            range_translation_m=self.search_range.translation_m,
-        )
+        findings = replace(findings, **_in_reach(*self.search_range))
         start = rig.moved_to({**rig.T_camera_lidar, **located})
         return Start(start, self._first_round(findings), findings)
 
@@ -246,12 +242,11 @@ class StructureMatcher:
 
     def _metadata(self, round_index: int, z_scores: Mapping[str, float]) -> dict[str, Any]:
         """The settings and findings of a round."""
-        reach = SearchRange(self.levels[0].rotation_rad, self.levels[0].translation_m)
+        first = self.levels[0]
         findings = MatcherFindings(
             z_score=z_scores,
             **error_components().matchers["structure"],
-            range_rotation_deg=reach.rotation_deg,
-            range_translation_m=reach.translation_m,
+            **_in_reach(first.rotation_rad, first.translation_m),
         )
         settings = {
             "matcher": "structure",
@@ -273,4 +268,10 @@ def _to_search_range(search_deg: float | None, search_m: float | None) -> Search
             f"the search reaches up to {MAX_SEARCH_DEG:g} deg and {MAX_SEARCH_M:g} m per axis, "
             f"found {search_deg:g} deg and {search_m:g} m"
         )
-    return SearchRange(float(np.radians(search_deg)), search_m)
+    return float(np.radians(search_deg)), search_m
+
+
+def _in_reach(rotation_rad: float, translation_m: float) -> dict[str, Any]:
+    """The range of a search, or of a round, as findings have it."""
+    degrees = float(np.degrees(rotation_rad))
+    return {"range_rotation_deg": degrees, "range_translation_m": translation_m}

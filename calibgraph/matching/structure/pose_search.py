@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -53,17 +53,8 @@ PROMISING, FEW_PROMISING = 10.6, 9.0
 9.5 and more, where wrong poses mostly end at 6 to 8.5."""
 
 
-@dataclass(frozen=True, eq=False)
-class SearchRange:
-    """How far from the guess to search, per axis."""
-
-    rotation_rad: float
-    translation_m: float
-
-    @property
-    def rotation_deg(self) -> float:
-        """The rotation in degrees."""
-        return float(np.degrees(self.rotation_rad))
+SearchRange = tuple[float, float]
+"""How far from the guess to search, per axis: rotation [rad], translation [m]."""
 
 
 class PoseSearch:
@@ -135,7 +126,7 @@ class PoseSearch:
         nothing = Candidate(body, -math.inf)
         if not maps.maps:
             return nothing
-        box = Box(lead(body).T_camera_lidar, self._range.rotation_rad, self._range.translation_m)
+        box = Box(lead(body).T_camera_lidar, *self._range)
         cores = self._frames[next(iter(body))].cores
         more = FEW_EFFORT * effort if self._few else effort
         found = search_box(maps, box, cores, effort=more, seed=self._seed + effort)
@@ -263,7 +254,7 @@ class PoseSearch:
                 frames.clouds,
                 camera,
                 frames.cores,
-                range_rad=self._range.rotation_rad,
+                range_rad=self._range[0],
                 max_windows=effort * windows // len(frames.grays),
                 dense=self._few,
                 seed=self._seed + 1000 * (effort - 1),

@@ -9,12 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.arrays import Array, Mask
-from calibgraph.matching.structure.directions import scan_angles, sphere_angles
-from calibgraph.matching.structure.visibility import find_visible
-from calibgraph.matching.structure.window_table import WindowTable, WindowTables
+from calibgraph.matching.structure.directions import find_visible, scan_angles, sphere_angles
+from calibgraph.matching.structure.prepared_image import Derived
+from calibgraph.matching.structure.window_table import WindowTable
 from calibgraph.memory import mmap_copy
 from calibgraph.model.geometry import camera_center
 from calibgraph.model.rig import Camera
+from calibgraph.parallel import KeyedCache
 
 MIN_RANGE_M = 1.5  # nearer returns are the vehicle itself
 ORIGIN_CELL_RAD, MAX_HIDDEN_FROM_ORIGIN = np.radians(0.3), 0.04
@@ -33,21 +34,19 @@ class PreparedCloud:
         angles: (n, 2) azimuth and elevation [rad] about the LiDAR frame's origin.
         seen_from_origin: whether the points were measured from the LiDAR frame's origin. Clouds
             that join several sensors, or are in a vehicle's frame, were not.
-        tables: where the windows of this and other clouds are kept.
-        identity: by which they know this cloud; not the cloud, which knows them.
+        derived: where the windows of this and other clouds are kept, see :class:`PreparedImage`.
+        identity: by which it knows this cloud; not the cloud, which knows it.
     """
 
     points_lidar_m: Array
     intensity_rank: Array
     angles: Array
     seen_from_origin: bool
-    tables: WindowTables = field(default_factory=WindowTables)
+    derived: Derived = field(default_factory=KeyedCache)
     identity: object = field(default_factory=object)
 
     @staticmethod
-    def from_points(
-        cloud: NDArray[np.float32], tables: WindowTables | None = None
-    ) -> PreparedCloud:
+    def from_points(cloud: NDArray[np.float32], derived: Derived | None = None) -> PreparedCloud:
         """Prepare a cloud, (n, 4) x y z [m] and intensity (NaN where there is none)."""
         points = cloud[:, :3].astype(np.float64)
         distance_m = np.linalg.norm(points, axis=1)
@@ -61,7 +60,7 @@ class PreparedCloud:
             mmap_copy(_ranks(intensity) / max(1, len(intensity))),
             mmap_copy(angles),
             seen_from_origin=bool(hidden.sum() <= MAX_HIDDEN_FROM_ORIGIN * len(hidden)),
-            tables=tables or WindowTables(),
+            derived=derived or KeyedCache(),
         )
 
     @property
@@ -99,10 +98,11 @@ class PreparedCloud:
             keep_linear=fine,
         )
         if self.seen_from_origin:
-            return self.tables.get(
+            kept: WindowTable = self.derived.get(
                 (self.identity, spacing_rad, stride_spacings, fine),
                 lambda: table(self.points_lidar_m, self.intensity_rank, self.angles),
             )
+            return kept
         rows = np.flatnonzero(usable)
         rays_m = self.points_lidar_m.take(rows, axis=0) - self.viewpoint_lidar_m(camera)
         return table(rays_m, self.intensity_rank[rows], sphere_angles(rays_m), rows)

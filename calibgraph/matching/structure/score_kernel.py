@@ -11,12 +11,11 @@ remainders, and only as long as their values fit the 32 registers: hence the num
 """
 
 import math
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calibgraph.memory import mmap_zeros
 from factors.compiled import compiled
 
 GRAY_NOISE = 0.05  # of the logarithm of gray: below, a window counts as flat in the image
@@ -36,15 +35,10 @@ _TO_FACTOR = np.float32(1 / (1 + MIN_RESIDUAL_SHARE))
 _index = np.uint64  # numba tests other integers for negative ones
 
 
-def pad(
-    image: NDArray[np.float32], make: Callable[..., NDArray[Any]] = np.zeros
-) -> NDArray[np.float32]:
-    """(h + LINES, w + LANES) an image with zero mean, and zeros: strips may begin anywhere.
-
-    In an array of zeros that is made from its shape and dtype.
-    """
+def pad(image: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(h + LINES, w + LANES) an image with zero mean, and zeros: strips may begin anywhere."""
     height, width = image.shape
-    padded = make((height + LINES, width + LANES), np.float32)
+    padded: NDArray[np.float32] = mmap_zeros((height + LINES, width + LANES), np.float32)
     np.subtract(image, image.mean(), out=padded[:height, :width])
     return padded
 

@@ -11,12 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.arrays import Array
-from calibgraph.matching.structure.directions import view_angles
+from calibgraph.matching.structure.directions import (
+    find_in_view,
+    find_places,
+    find_visible,
+    name_cells,
+    view_angles,
+)
 from calibgraph.matching.structure.prepared_cloud import PreparedCloud
 from calibgraph.matching.structure.prepared_image import PreparedImage
 from calibgraph.matching.structure.schedule import Level
 from calibgraph.matching.structure.score_kernel import score_windows
-from calibgraph.matching.structure.visibility import find_in_view, find_places, find_visible
 from calibgraph.matching.structure.window_weights import window_network
 from calibgraph.matching.structure.windows import Windows, weigh
 from calibgraph.memory import mmap_zeros
@@ -83,7 +88,7 @@ def score_frame(  # noqa: PLR0913 - what is scored, and how
     With the twist of the LiDAR, (6,), when the camera takes it.
     """
     camera = when_taken(camera, twist_per_s)
-    image, scale = gray.padded_log_gray(camera, level.step_rad, level.blur_steps)
+    image, scale = gray.log_gray(camera, level.step_rad, level.blur_steps)
     windows = select_windows(cloud, camera, level, max_windows=max_windows)
     T, viewpoint_m = camera.T_camera_lidar, cloud.viewpoint_lidar_m(camera)
     centres_m = windows["rays_m"][:, 0] + viewpoint_m
@@ -124,7 +129,8 @@ def select_windows(
     lens = camera.lens.kind, camera.lens.packed.tobytes(), camera.width_px, camera.height_px
     cut = level.spacing_rad, level.stride_spacings, level.weighed
     key = cloud.identity, camera.T_camera_lidar.tobytes(), lens, cut, max_windows
-    return cloud.tables.select(key, select)
+    kept: Windows = cloud.derived.get(key, select)
+    return kept
 
 
 def _select_windows(
@@ -197,16 +203,6 @@ def group_windows(
     group = (np.cumsum(full) - 1)[cell[kept]]
     order = np.argsort(group, kind="stable")
     return kept[order], group[order].astype(np.int32), sizes[full]
-
-
-def name_cells(places: Array) -> NDArray[np.int64]:
-    """(n,) a number per cell of places (n, 3) on a grid of step 1, in the order of the columns."""
-    cells = np.floor(places).astype(np.int64)
-    if not len(cells):
-        return np.empty(0, np.int64)
-    cells -= cells.min(axis=0)
-    rows, columns = cells[:, 1].max() + 1, cells[:, 2].max() + 1
-    return np.asarray((cells[:, 0] * rows + cells[:, 1]) * columns + cells[:, 2])
 
 
 def mean_by_group(points: Array, group: NDArray[np.int32], counts: NDArray[np.int64]) -> Array:

@@ -1,6 +1,5 @@
 """The windows of a cloud, cut where a camera looks and kept for the next pose and camera."""
 
-from collections.abc import Callable, Hashable, Iterable
 from threading import Lock
 
 import numpy as np
@@ -11,11 +10,9 @@ from calibgraph.arrays import Array, Mask
 from calibgraph.matching.structure.directions import thin
 from calibgraph.matching.structure.windows import WINDOW, Windows, cut_windows
 from calibgraph.memory import mmap_copy, mmap_zeros
-from calibgraph.parallel import KeyedCache
 
 Rows = NDArray[np.intp]
 
-MAX_BYTES, MAX_SELECTED_BYTES = 500_000_000, 220_000_000  # of all tables, and all selections
 _UNCUT, _USELESS = -1, -2
 
 
@@ -105,25 +102,3 @@ class WindowTable:
         cut = self._count * self._windows.nbytes // max(1, len(self._slots))
         kept = self._rows.nbytes + self._slots.nbytes + 2 * self._centres.nbytes
         return cut + kept + 2 * int(self._tree.data.nbytes)
-
-
-class WindowTables:
-    """The tables of several clouds, and what was selected of them: those used last."""
-
-    def __init__(self) -> None:
-        self._tables: KeyedCache[tuple[Hashable, ...], WindowTable] = KeyedCache(MAX_BYTES)
-        self._selected: KeyedCache[tuple[Hashable, ...], Windows] = KeyedCache(MAX_SELECTED_BYTES)
-
-    def get(self, key: tuple[Hashable, ...], make: Callable[[], WindowTable]) -> WindowTable:
-        """The table of a key whose first entry is the cloud; made if it is missing."""
-        return self._tables.get(key, make)
-
-    def select(self, key: tuple[Hashable, ...], make: Callable[[], Windows]) -> Windows:
-        """The windows that a camera sees, of a key whose first entry is the cloud."""
-        return self._selected.get(key, make)
-
-    def keep_only(self, clouds: Iterable[Hashable]) -> None:
-        """Drop what is of all other clouds."""
-        kept = set(clouds)
-        self._tables.keep_only(lambda key: key[0] in kept)
-        self._selected.keep_only(lambda key: key[0] in kept)

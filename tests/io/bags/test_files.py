@@ -219,9 +219,9 @@ BLOCK = bytes(2**20)
 
 
 @cache
-def zstd_bomb(size: int = BOMB_BYTES) -> bytes:
+def zstd_bomb() -> bytes:
     packer = zstandard.ZstdCompressor().compressobj()
-    parts = [packer.compress(BLOCK) for _ in range(size // len(BLOCK))]
+    parts = [packer.compress(BLOCK) for _ in range(BOMB_BYTES // len(BLOCK))]
     return b"".join([*parts, packer.flush()])
 
 
@@ -236,14 +236,9 @@ def bz2_bomb() -> bytes:
     return b"".join([*(packer.compress(BLOCK) for _ in range(200)), packer.flush()])
 
 
-def mcap_bomb(folder: Path) -> Path:
-    """One chunk of 2 GiB, as its index states."""
-    return _mcap(folder, zstd_bomb(), BOMB_BYTES)
-
-
-def mcap_liar(folder: Path) -> Path:
-    """The same, of which the index states 1 MiB."""
-    return _mcap(folder, zstd_bomb(), 2**20)
+def mcap_bomb(stated: int) -> Callable[[Path], Path]:
+    """A file with one chunk of 2 GiB, of which its index states a size."""
+    return lambda folder: _mcap(folder, zstd_bomb(), stated)
 
 
 def _mcap(folder: Path, packed: bytes, stated: int) -> Path:
@@ -275,7 +270,7 @@ def _mcap(folder: Path, packed: bytes, stated: int) -> Path:
     return path
 
 
-def ros1_bomb(kind: str, packed: bytes) -> Callable[[Path], Path]:
+def ros1_bomb(kind: str, pack: Callable[[], bytes]) -> Callable[[Path], Path]:
     """A bag whose chunks are replaced by a bomb, as long as those were or a little longer."""
 
     def make(folder: Path) -> Path:
@@ -285,6 +280,7 @@ def ros1_bomb(kind: str, packed: bytes) -> Callable[[Path], Path]:
         at = data.index(mark)
         size_at = data.index(b"size=", at) + len(b"size=") + 4
         (size,) = struct.unpack_from("<I", data, size_at)
+        packed = pack()
         assert len(packed) <= size
         start = size_at + 4
         path.write_bytes(data[:start] + packed.ljust(size, b"\0") + data[start + size :])
@@ -329,10 +325,13 @@ GENERATED = (
 )
 
 BOMBS: dict[str, tuple[Callable[[Path], Path], str]] = {
-    "mcap": (mcap_bomb, "unpack to 2047 MiB or more, which no recording does"),
-    "mcap whose index states less": (mcap_liar, "is truncated, was not closed or is no ROS bag"),
-    "lz4": (ros1_bomb("LZ4", lz4_bomb()), "MiB, which no recording does"),
-    "bz2": (ros1_bomb("BZ2", bz2_bomb()), "MiB, which no recording does"),
+    "mcap": (mcap_bomb(BOMB_BYTES), "unpack to 2047 MiB or more, which no recording does"),
+    "mcap whose index states less": (
+        mcap_bomb(2**20),
+        "is truncated, was not closed or is no ROS bag",
+    ),
+    "lz4": (ros1_bomb("LZ4", lz4_bomb), "MiB, which no recording does"),
+    "bz2": (ros1_bomb("BZ2", bz2_bomb), "MiB, which no recording does"),
     "messages": (db3_bomb, "unpack to more than 64 MiB, which no recording does"),
     "endless view": (computed(ENDLESS), "it has no tables messages and topics"),
     "computed data": (computed(GENERATED), "string or blob too big"),

@@ -161,16 +161,6 @@ def test_organised_clouds_with_padded_rows_are_read() -> None:
     np.testing.assert_array_equal(cloud_from_message(message, "here"), CLOUD)
 
 
-def test_points_without_a_return_are_left_out() -> None:
-    cloud = CLOUD.copy()
-    cloud[3, :3] = np.nan
-    cloud[5, 1] = np.nan
-    cloud[8, 0] = np.inf
-    cloud[20, :3] = 0.0
-    found = cloud_from_message(MAKE.cloud(structured(cloud), START_NS, height=4), "here")
-    np.testing.assert_array_equal(found, np.delete(CLOUD, [3, 5, 8, 20], axis=0))
-
-
 @pytest.mark.parametrize("value", [0.0, np.nan])
 def test_a_scan_that_sees_nothing_has_no_points(value: float) -> None:
     assert not has_points(MAKE.cloud(structured(np.full_like(CLOUD, value)), START_NS), "here")

@@ -29,7 +29,7 @@ from calibgraph.io.bags.rig import doubtful_axes
 from calibgraph.io.bags.topics import choose_topics, is_rectified
 from calibgraph.io.bags.transforms import Transforms
 from calibgraph.io.rig_parts import Link, find_mounts
-from calibgraph.model.geometry import invert, transform
+from calibgraph.model.geometry import transform
 from tests.conftest import SAMPLE, make_camera
 from tests.io.bags.writing import (
     KINDS,
@@ -39,11 +39,9 @@ from tests.io.bags.writing import (
     sample_bag,
     sample_messages,
     structured,
-    tree_of,
     without,
     write_bag,
 )
-from tests.io.formats.readers import READERS
 
 MAKE = Messages("mcap")
 GRAY = np.full((4, 6), 7, np.uint8)
@@ -283,33 +281,6 @@ def test_a_result_and_its_exports_name_the_frames_of_the_bag(
     assert "velodyne" in text
     assert all(frame in text for frame in IDS.values())
     assert "left_optical_frame" not in text
-
-
-EDGES = {child: (parent, T) for parent, child, T in tree_of(load_rig(SAMPLE))}
-
-
-def in_base(tree: dict[str, tuple[str, Any]], frame: str) -> Any:
-    """(4, 4) of a frame in the root, link by link."""
-    T = np.eye(4)
-    while frame in tree:
-        frame, T_parent_child = tree[frame]
-        T = T_parent_child @ T
-    return T
-
-
-def test_the_exported_transforms_replace_those_of_the_robots_tree(
-    result: Path, tmp_path: Path
-) -> None:
-    estimate = load_calibration(result).rig.T_camera_lidar
-    export_calibration(result, tmp_path / "out", "ros2-launch", even_if_failed=True)
-    T_base_link = READERS["ros2-launch"](tmp_path / "out")
-    assert T_base_link.keys() == {f"{name}_link" for name in IDS}
-    changed = {link: ("base", invert(T)) for link, T in T_base_link.items()}
-    tree = {**EDGES, **changed}  # as tf has it, with one parent for each frame
-    assert tree.keys() == EDGES.keys()
-    for name, frame in IDS.items():
-        T_camera_lidar = invert(in_base(tree, frame)) @ in_base(tree, "velodyne")
-        np.testing.assert_allclose(T_camera_lidar, estimate[name], atol=1e-9)
 
 
 def test_the_exported_transforms_are_read_back_over_the_robots_description(

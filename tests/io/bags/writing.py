@@ -136,23 +136,12 @@ class Messages:
         return self.make("tf2_msgs/msg/TFMessage", transforms=stamped)
 
 
-def structured(
-    cloud: NDArray[np.float32], names: str = "xyzi", *, order: str = "<", gap: int = 0
-) -> NDArray[np.void]:
-    """(n,) a cloud as points with fields in this order, and bytes between them."""
-    columns = {"x": 0, "y": 1, "z": 2, "i": 3}
-    offsets = [gap + (4 + gap) * k for k in range(len(names))]
-    kind = np.dtype(
-        {
-            "names": ["intensity" if name == "i" else name for name in names],
-            "formats": [f"{order}f4"] * len(names),
-            "offsets": offsets,
-            "itemsize": offsets[-1] + 4 + gap,
-        }
-    )
-    points = np.zeros(len(cloud), kind)
-    for name in names:
-        points["intensity" if name == "i" else name] = cloud[:, columns[name]]
+def structured(cloud: NDArray[np.float32], names: str = "xyzi") -> NDArray[np.void]:
+    """(n,) a cloud as points with fields in this order."""
+    fields = ["intensity" if name == "i" else name for name in names]
+    points = np.zeros(len(cloud), [(field, "<f4") for field in fields])
+    for name, field in zip(names, fields, strict=True):
+        points[field] = cloud[:, "xyzi".index(name)]
     return points
 
 

@@ -6,9 +6,7 @@ import numpy as np
 import yaml
 
 TEXTS = yaml.safe_load((Path(__file__).parent / "forms.yaml").read_text())["texts"]
-CAMERA_INFO, KALIBR, URDF, SENSOR_KIT, KOIDE = (
-    TEXTS[name] for name in ("info", "camchain", "urdf", "kit", "koide")
-)
+CAMERA_INFO, KALIBR, URDF, KOIDE = (TEXTS[name] for name in ("info", "camchain", "urdf", "koide"))
 FRONT = np.array([[0, -1, 0, 0.1], [0, 0, -1, -0.2], [1, 0, 0, -0.4], [0, 0, 0, 1.0]])
 SENTENCE = "front looks along LiDAR +x, sits 0.40 m ahead, 0.10 m left and 0.20 m below the LiDAR"
 

@@ -14,7 +14,6 @@ from urdf_parser_py.urdf import URDF
 from calibgraph import (
     Calibration,
     CalibrationError,
-    Camera,
     FileError,
     Rig,
     export_calibration,
@@ -109,6 +108,18 @@ def test_lenses_are_exported_under_the_names_of_others(mixed_rig: Rig, tmp_path:
         coefficients = node.getNode("distortion_coefficients").mat().ravel()
         np.testing.assert_array_equal(coefficients, camera.distortion)
         assert node.getNode("fisheye_model").real() == (camera.model == "fisheye")
+    omni = rig_of("omni")
+    (xi, *coefficients), lens = omni.cameras["front"].distortion, omni.cameras["front"]
+    export_calibration(omni, tmp_path / "omni.yaml", "kalibr")
+    found = yaml.safe_load((tmp_path / "omni.yaml").read_text())["cam0"]
+    assert (found["camera_model"], found["distortion_model"]) == ("omni", "radtan")
+    assert found["intrinsics"] == [xi, *lens.intrinsics_px.model_dump().values()]
+    assert found["distortion_coeffs"] == coefficients
+    export_calibration(omni, tmp_path / "omni.yml", "opencv")
+    file = cv2.FileStorage(str(tmp_path / "omni.yml"), cv2.FILE_STORAGE_READ)
+    node = file.getNode("camera_0")
+    assert node.getNode("xi").real() == xi
+    assert node.getNode("distortion_coefficients").mat().ravel().tolist() == coefficients
 
 
 def test_a_lens_that_a_format_cannot_hold_is_refused(mixed_rig: Rig, tmp_path: Path) -> None:
@@ -266,51 +277,3 @@ def test_the_name_in_a_file_is_the_files(tmp_path: Path) -> None:
     rig = Rig(cameras={"front left": make_pair().cameras["left"]})
     (file,) = export_calibration(rig, tmp_path, "camera_info")
     assert yaml.safe_load(file.read_text())["camera_name"] == file.stem == "front_left"
-
-
-POINT = np.array([2.0, -0.7, -0.4])  # behind the lens
-
-
-@pytest.fixture
-def omni() -> Camera:
-    return rig_of("omni").cameras["front"]
-
-
-def unified_pixel(xi: float, focal: list[float], coefficients: list[float]) -> list[float]:
-    """cv2.omnidir.projectPoints, and Kalibr's omni-radtan, of a point in the camera frame."""
-    x, y, z = POINT / np.linalg.norm(POINT)
-    u, v = x / (z + xi), y / (z + xi)
-    k1, k2, p1, p2 = coefficients
-    r2 = u * u + v * v
-    radial = 1 + k1 * r2 + k2 * r2 * r2
-    fx, fy, cx, cy = focal
-    return [
-        fx * (u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u)) + cx,
-        fy * (v * radial + p1 * (r2 + 2 * v * v) + 2 * p2 * u * v) + cy,
-    ]
-
-
-@pytest.mark.parametrize("format", ["kalibr", "opencv", "json"])
-def test_a_unified_lens_projects_in_other_formats_as_here(
-    format: str, omni: Camera, tmp_path: Path
-) -> None:
-    path = tmp_path / "file.yml"
-    export_calibration(Rig(cameras={"front": omni}), path, format)
-    if format == "kalibr":
-        camera = yaml.safe_load(path.read_text())["cam0"]
-        assert (camera["camera_model"], camera["distortion_model"]) == ("omni", "radtan")
-        (xi, *focal), coefficients = camera["intrinsics"], camera["distortion_coeffs"]
-    elif format == "opencv":
-        file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
-        node = file.getNode("camera_0")
-        K = node.getNode("camera_matrix").mat()
-        focal, xi = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]], node.getNode("xi").real()
-        coefficients = node.getNode("distortion_coefficients").mat().ravel().tolist()
-    else:
-        camera = json.loads(path.read_text())["cameras"]["front"]
-        assert camera["model"] == "omnidirectional"
-        focal = [camera["intrinsics_px"][key] for key in ("fx", "fy", "cx", "cy")]
-        xi, *coefficients = camera["distortion"]
-    pixels, valid = omni.lens.project(POINT)
-    np.testing.assert_allclose(unified_pixel(xi, focal, coefficients), pixels[0], atol=1e-9)
-    assert valid.all()

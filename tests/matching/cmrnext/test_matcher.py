@@ -9,13 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 import calibgraph
-from calibgraph import (
-    Calibration,
-    Correspondences,
-    Dataset,
-    Rig,
-    load_rig,
-)
+from calibgraph import Calibration, Correspondences, Dataset, Rig, load_rig
 from calibgraph.matching.cmrnext import CmrNextMatcher
 from calibgraph.matching.cmrnext.flow_matching import FlowMatcher, MatchingJob, to_table
 from calibgraph.matching.cmrnext.inputs import LidarImage, network_size

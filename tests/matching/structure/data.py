@@ -17,10 +17,8 @@ def without_search(levels: Sequence[Level]) -> StructureMatcher:
     return StructureMatcher(search_deg=None, search_m=None, levels=levels)
 
 
-def far_from(truth: Rig, seed: int, degrees: float = 20.0, metres: float = 1.5) -> Rig:
-    return calibgraph.perturb(
-        truth, rotation_deg=degrees, translation_m=metres, seed=seed, uniform=True
-    )
+def far_from(truth: Rig, seed: int) -> Rig:
+    return calibgraph.perturb(truth, rotation_deg=20, translation_m=1.5, seed=seed, uniform=True)
 
 
 def never() -> bool:

@@ -1,14 +1,11 @@
 """Prepared images, and the scores of windows in them."""
 
-import cv2
 import numpy as np
 import pytest
 
 import calibgraph
 from calibgraph import Rig
-from calibgraph.matching.structure import frame_cache
 from calibgraph.matching.structure.consensus import z_score
-from calibgraph.matching.structure.frame_cache import FrameCache
 from calibgraph.matching.structure.prepared_cloud import PreparedCloud
 from calibgraph.matching.structure.prepared_image import PreparedImage
 from calibgraph.matching.structure.schedule import LEVELS
@@ -21,32 +18,9 @@ from calibgraph.matching.structure.score_kernel import (
     pad,
     score_windows,
 )
-from calibgraph.matching.structure.shift_scores import score_frame, subtract_mean_score
+from calibgraph.matching.structure.shift_scores import score_frame
 from calibgraph.model.rig import Camera
 from tests.conftest import SAMPLE
-
-
-def test_an_image_is_scaled_once_for_each_size(monkeypatch: pytest.MonkeyPatch) -> None:
-    data, cache = calibgraph.load_dataset(SAMPLE), FrameCache()
-    camera = data.rig.cameras["left"]
-    image, other = (cache.image(frame, "left", camera) for frame in data.frames[:2])
-    small, scale = image.log_gray(camera, 0.02, 1.0)
-    assert small.shape == (round(scale[1] * camera.height_px), round(scale[0] * camera.width_px))
-    padded, same = image.padded_log_gray(camera, 0.02, 1.0)
-    np.testing.assert_array_equal(padded, pad(small))
-    np.testing.assert_array_equal(scale, same)
-    assert image.padded_log_gray(camera, 0.02, 1.0)[0] is padded
-    assert image.padded_log_gray(camera, 0.01, 1.0)[0].shape > padded.shape
-    assert (other.padded_log_gray(camera, 0.02, 1.0)[0] != padded).any()
-    np.testing.assert_array_equal(image.mirrored().gray, image.gray[:, ::-1])
-    cache.keep_only(data.frames[2:])
-    assert not image.smaller.values()
-    monkeypatch.setattr(frame_cache, "MAX_SMALL_BYTES", padded.nbytes)
-    cache = FrameCache()
-    image, other = (cache.image(frame, "left", camera) for frame in data.frames[:2])
-    kept = image.padded_log_gray(camera, 0.02, 1.0)[0]
-    other.padded_log_gray(camera, 0.02, 1.0)
-    assert image.padded_log_gray(camera, 0.02, 1.0)[0] is not kept
 
 
 def test_images_finer_than_the_finest_level_needs_are_reduced() -> None:
@@ -110,37 +84,6 @@ def formula(seen: np.ndarray, basis: np.ndarray, likelihood: bool) -> float:
     chance = [CHANCE_DEPTH, CHANCE_INTENSITY] @ np.square(basis[:, :2].astype(np.float64)).sum(0)
     share = explained / variance - chance * (1 - noise / variance)
     return float(-np.log(1 - share / (1 + MIN_RESIDUAL_SHARE)) if likelihood else share)
-
-
-def test_unrelated_windows_score_no_higher_on_structure_than_on_a_flat_image() -> None:
-    rng = np.random.default_rng(0)
-    image = cv2.GaussianBlur(rng.standard_normal((60, 60)), (0, 0), 1.0).astype(np.float32)
-    image[:, :30] = image.mean()
-    places = np.stack(np.meshgrid(range(-2, 3), range(-2, 3)), axis=-1).reshape(1, 25, 2)
-    grids = np.zeros((1, 60, 60), np.float32)
-    for angle in rng.uniform(0, 2 * np.pi, 400):  # a silhouette each
-        near = np.sign(places[0] @ [np.cos(angle), np.sin(angle)] + rng.uniform(-1, 1))
-        basis = np.zeros((1, 25, 4), np.float32)
-        basis[0, :, 0] = (near - near.mean()) / np.linalg.norm(near - near.mean())
-        score_windows(
-            pad(image), places.astype(np.int32), np.array([25], np.int32), basis,
-            np.zeros(1, np.int32), np.zeros(2, np.int64), False, grids,
-        )  # fmt: skip
-    flat, structured = grids[0, 5:55, 5:25].mean() / 400, grids[0, 5:55, 35:55].mean() / 400
-    assert abs(structured - flat) < 0.5 * CHANCE_DEPTH
-
-
-def test_windows_that_tell_nothing_do_not_hold_a_group_in_the_image() -> None:
-    """A score that each window has wherever it is in the image is none; what is above it stays."""
-    inside = np.random.default_rng(0).integers(0, 20, (3, 9, 13)).astype(np.float32)
-    inside[1] = 0  # a group that is never in it
-    inside[2] = 20  # and one that never leaves
-    grids = 0.3 * inside
-    grids[2, 4, 6] += 1
-    subtract_mean_score(grids, inside)
-    np.testing.assert_allclose(grids[:2], 0, atol=1e-5)
-    assert grids[2, 4, 6] - grids[2, 0, 0] == pytest.approx(1)
-    np.testing.assert_allclose(grids.mean(axis=(1, 2)), 0, atol=1e-5)
 
 
 def test_scores_of_a_frame_agree_at_the_true_pose(truth: Rig) -> None:

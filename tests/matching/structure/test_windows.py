@@ -1,21 +1,18 @@
 """Which points a camera sees, the nearest rays of a ray, and the windows made of them."""
 
-import itertools
-
 import numpy as np
 import pytest
 
 import calibgraph
 from calibgraph import Camera, Intrinsics, Rig
-from calibgraph.matching.structure.directions import sphere_angles, thin, view_angles
+from calibgraph.matching.structure.directions import (
+    find_in_view,
+    find_visible,
+    view_angles,
+)
 from calibgraph.matching.structure.prepared_cloud import PreparedCloud
 from calibgraph.matching.structure.schedule import LEVELS
 from calibgraph.matching.structure.shift_scores import select_windows
-from calibgraph.matching.structure.visibility import (
-    find_in_view,
-    find_visible,
-)
-from calibgraph.matching.structure.window_table import WindowTable
 from tests.conftest import KANNALA, SAMPLE, make_camera
 
 T = np.array([[0.0, -1.0, 0.0, 0.1], [0.0, 0.0, -1.0, -0.2], [1.0, 0.0, 0.0, 0.3], [0, 0, 0, 1]])
@@ -67,16 +64,6 @@ def test_background_behind_a_near_object_is_hidden() -> None:
     assert visible[:-100][np.abs(wall[:, 0]) > 0.5].all()
 
 
-def test_thinned_directions_are_as_dense_everywhere() -> None:
-    rng = np.random.default_rng(0)
-    rays = rng.standard_normal((400_000, 3))
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    kept = rays[thin(sphere_angles(rays), 0.02)]
-    cells = 2 * np.pi * (1 - np.cos(0.5)) / 0.02**2  # of a cone of 0.5 rad
-    for axis in np.vstack([np.eye(3), -np.eye(3)]):
-        assert np.count_nonzero(kept @ axis > np.cos(0.5)) == pytest.approx(cells, rel=0.1)
-
-
 def test_windows_come_from_clouds_with_and_without_intensity(truth: Rig) -> None:
     raw = calibgraph.load_dataset(SAMPLE, truth).frames[0].load_cloud()
     camera = truth.cameras["front_left"]
@@ -113,28 +100,3 @@ def test_fisheyes_and_views_past_90_degrees_give_windows() -> None:
     z = (windows["rays_m"].reshape(-1, 3) @ T[:3, :3].T + T[:3, 3])[:, 2]
     assert z.min() < 0 < z.max()
     assert len(windows) > 100
-
-
-def test_members_behind_a_silhouette_are_moved_to_it() -> None:
-    """A post at 5 m before a wall at 20 m: no window has members at both distances."""
-    angles = np.radians(np.arange(-6, 6, 0.2))
-    rays = np.array([[1.0, np.tan(a), np.tan(e)] for a, e in itertools.product(angles, angles)])
-    post = np.abs(rays[:, 1]) < np.tan(np.radians(1.0))
-    rays *= np.where(post, 5.0, 20.0)[:, None]
-    table = WindowTable(
-        rays,
-        np.ones(len(rays)),
-        sphere_angles(rays),
-        spacing_rad=np.radians(0.2),
-        stride_spacings=2.0,
-        keep_linear=False,
-    )
-    everywhere = np.ones(len(rays), np.bool_)
-    windows = table.cut(everywhere, everywhere, max_covered=0.0, max_windows=10_000)
-    at_edge = ~windows["front"].all(axis=1)
-    assert np.count_nonzero(at_edge) > 20
-    assert windows["rays_m"][at_edge][..., 0].max() < 5.2
-    along = windows["rays_m"] / np.linalg.norm(windows["rays_m"], axis=2, keepdims=True)
-    given = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-    gap = np.linalg.norm(along.reshape(-1, 1, 3)[:500] - given, axis=2).min(axis=1)
-    assert gap.max() < 1e-6  # along their own rays
