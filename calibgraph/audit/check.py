@@ -1,7 +1,7 @@
 """``check``: is the calibration that is deployed still right?"""
 
 import logging
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -12,13 +12,14 @@ from calibgraph.audit.judgement import (
     FALSE_ALARM_RATE,
     SEARCHES_FARTHER,
     Limits,
+    Measured,
     deviation_of,
     find_lidar_motion,
     has_too_few_frames,
     judge_camera,
     tolerance_twist,
 )
-from calibgraph.audit.lidars import MeasuredLidars, measure_lidars
+from calibgraph.audit.lidars import measure_lidars
 from calibgraph.audit.result import Audit, CameraAudit
 from calibgraph.errors import CorrespondenceError, FileError
 from calibgraph.io.calibrations import stated_result
@@ -116,26 +117,26 @@ def check(
     deployed = loaded.model_copy(update={"relative_poses": ()})
     given = dataset if isinstance(dataset, Dataset) else load_dataset(dataset, deployed)
     same_recording, verdict = (False, None) if isinstance(rig, Rig) else provenance(rig, given)
-    lidars = None
+    measured = list[Measured]()
     if deployed.other_lidars:
         with watch("lidars"):
             given, lidars = measure_lidars(
                 deployed, given, Config(seed=seed), tolerance, matcher=matcher, progress=report
             )
+            measured.append(lidars)
     with watch("choose_frames"):
         data = _open(given, deployed, full) if deployed.cameras else given
-    cameras, evidence = dict[str, CameraAudit](), None
     if deployed.cameras:
-        cameras, evidence = _measure_cameras(
+        cameras = _measure_cameras(
             data, deployed, full, tolerance, config=Config(seed=seed), watch=watch, progress=report
         )
-    lidar = _judge_lidar(evidence, cameras, lidars, tolerance)
+        measured.insert(0, cameras)
     middle = data.frames[len(data.frames) // 2].with_burnt_in({})  # as it was recorded
     sources = tuple(map(str, data.folders))
     return Audit(
-        cameras, lidar, deployed, middle, sources,
-        tolerance_deg, tolerance_cm, len(data.frames), watch.seconds, same_recording, verdict,
-        {} if lidars is None else lidars.audits,
+        cameras.audits if deployed.cameras else {}, _judge_lidar(measured, tolerance), deployed,
+        middle, sources, tolerance_deg, tolerance_cm, len(data.frames), watch.seconds,
+        same_recording, verdict, lidars.audits if deployed.other_lidars else {},
     )  # fmt: skip
 
 
@@ -155,8 +156,8 @@ def _open(data: Dataset, deployed: Rig, matcher: FullMatcher) -> Dataset:
 def _measure_cameras(
     data: Dataset, deployed: Rig, matcher: FullMatcher, tolerance: Array, *, config: Config,
     watch: Stopwatch, progress: Progress,
-) -> tuple[dict[str, CameraAudit], Evidence | None]:  # fmt: skip
-    """The audits of all cameras, and the evidence where every measurement can be trusted."""
+) -> Measured:  # fmt: skip
+    """The cameras by images and clouds."""
     try:
         run = match_from_deployed(data, deployed, matcher, config, watch=watch, progress=progress)
         with watch("places"):
@@ -174,46 +175,35 @@ def _measure_cameras(
         if not too_few_matches:  # a wrong table
             raise
         nothing = CameraAudit("CANNOT TELL", f"{error}; {SEARCHES_FARTHER}")
-        return dict.fromkeys(deployed.cameras, nothing), None
+        return Measured(dict.fromkeys(deployed.cameras, nothing))
     finally:
         matcher.release()
     trusted = not any(doubts.values()) and all(each.sigma is not None for each in cameras.values())
-    return cameras, evidence if trusted else None
+    return Measured(
+        cameras,
+        [deviation_of(evidence, name) for name in cameras],
+        evidence.joint_covariance if trusted else None,
+        -evidence.solution.by_lidars,
+        [*deployed.T_camera_lidar.values()],
+    )
 
 
-def _judge_lidar(
-    evidence: Evidence | None,
-    cameras: Mapping[str, CameraAudit],
-    lidars: MeasuredLidars | None,
-    tolerance: Array,
-) -> CameraAudit | None:
+def _judge_lidar(measured: Sequence[Measured], tolerance: Array) -> CameraAudit | None:
     """The motion of the LiDAR, of several the base, if one explains the deviations of all others.
 
     None where none is WRONG, or with a single one, which cannot be told from the LiDAR; and where
-    a measurement of a camera cannot be trusted.
+    a measurement cannot be trusted.
     """
-    deviations, poses = list[Array](), list[Array]()
-    joint, by_lidars = np.empty((0, 0)), np.empty((0, 0))
-    if cameras:
-        if evidence is None or evidence.joint_covariance is None:
-            return None
-        deviations += [deviation_of(evidence, name) for name in cameras]
-        joint, by_lidars = evidence.joint_covariance, evidence.solution.by_lidars
-        poses += [evidence.guess.T_camera_lidar[name] for name in cameras]
-    audits = {**cameras}
-    if lidars is not None:
-        if not lidars.T_lidar_base:
-            return None
-        deviations.append(lidars.deviation)
-        joint = joint_covariance(joint, -by_lidars, lidars.covariance, lidars.by_errors)
-        poses += lidars.T_lidar_base
-        audits |= lidars.audits
+    known = [(of.covariance, of.by_errors) for of in measured if of.covariance is not None]
+    if len(known) < len(measured):
+        return None
+    statuses = [audit.status for each in measured for audit in each.audits.values()]
     return find_lidar_motion(
-        np.concatenate(deviations),
-        joint,
-        poses,
-        moved=[k for k, each in enumerate(audits.values()) if each.status == "WRONG"],
-        quantile=Limits.of(np.inf, FALSE_ALARM_RATE / len(audits), tolerance).axis[0],
+        np.concatenate([one for each in measured for one in each.deviations]),
+        known[0][0] if len(known) == 1 else joint_covariance(*known[0], *known[1]),
+        [T for each in measured for T in each.poses],
+        moved=[k for k, status in enumerate(statuses) if status == "WRONG"],
+        quantile=Limits.of(np.inf, FALSE_ALARM_RATE / len(statuses), tolerance).axis[0],
     )
 
 

@@ -12,8 +12,9 @@ part, of the error that all frames share, is known. Of 1000 rigs that have not m
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -182,6 +183,24 @@ def _advise(needed: Array, blind: Mask, *, recording_helps: bool) -> str:
     near, all_over = "are within 10 m", "are all over the image"
     where = f"where walls, poles or vehicles {near if blind[3:].any() else all_over}"
     return f"{_UNSEEN}: tolerate {enough}, or record more frames, {where}"
+
+
+class Measured(NamedTuple):
+    """Sensors that were measured again.
+
+    Attributes:
+        audits: per sensor.
+        deviations: (6,) of each, as of an audit.
+        covariance: (6 k, 6 k) of all; None if one of them cannot be trusted.
+        by_errors: (6 k, e) of the deviations by a standard deviation of errors of LiDARs' poses.
+        poses: (4, 4) T_camera_lidar of each as deployed; another LiDAR counts as a camera.
+    """
+
+    audits: Mapping[str, CameraAudit]
+    deviations: Sequence[Array] = ()
+    covariance: Array | None = None
+    by_errors: Array = np.empty((0, 0))
+    poses: Sequence[Array] = ()
 
 
 def find_lidar_motion(

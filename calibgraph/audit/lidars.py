@@ -6,8 +6,6 @@ result have error bars, which count beside those of the measurement.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
 import numpy as np
 from scipy.linalg import block_diag
 
@@ -17,6 +15,7 @@ from calibgraph.audit.judgement import (
     LIDAR_AXES,
     SINGLE_LIDAR,
     Limits,
+    Measured,
     detectable,
     judge_deviation,
 )
@@ -36,29 +35,10 @@ _LEAST_FREEDOM = 3.0  # of one place, where the size is a prior
 _UNUSABLE = ("lidar_matched", "lidar_start")  # kinds of checks
 
 
-@dataclass(frozen=True, eq=False)
-class MeasuredLidars:
-    """The LiDARs but the base, measured again.
-
-    Attributes:
-        audits: per LiDAR.
-        deviation: (6 k,) of all, as of an audit; empty if they could not be measured.
-        covariance: (6 k, 6 k) of it.
-        T_lidar_base: (4, 4) each, as deployed.
-        by_errors: (6 k, 6 k) of the deviation by a standard deviation of each error of the poses.
-    """
-
-    audits: dict[str, CameraAudit]
-    deviation: Array
-    covariance: Array
-    T_lidar_base: list[Array]
-    by_errors: Array = field(default_factory=lambda: np.empty((0, 0)))
-
-
 def measure_lidars(
     deployed: Rig, data: Dataset, config: Config, tolerance: Array, *,
     matcher: AnyMatcher = "structure", progress: Progress,
-) -> tuple[Dataset, MeasuredLidars]:  # fmt: skip
+) -> tuple[Dataset, Measured]:  # fmt: skip
     """Measure the LiDARs of a rig again, and compare them with where they are deployed.
 
     Args:
@@ -70,7 +50,7 @@ def measure_lidars(
         progress: called as the work goes on.
 
     Returns:
-        The dataset, its clouds joined where cameras gain; and the LiDARs.
+        The dataset, its clouds joined where cameras gain; and the LiDARs but the base.
 
     Raises:
         RigError: if a LiDAR has no pose.
@@ -89,7 +69,7 @@ def measure_lidars(
         if error.__class__ is not CalibrationError:  # of the data
             raise
         audits = {name: CameraAudit("CANNOT TELL", str(error)) for name in names}
-        return data, MeasuredLidars(audits, np.empty(0), np.empty((0, 0)), [])
+        return data, Measured(audits)
     T_lidar_base = [invert(known[name]) for name in names]
     now = found.poses.T_base_lidar
     deviations = [
@@ -115,8 +95,7 @@ def measure_lidars(
         audits[name] = CameraAudit(
             status, reason, deviations[row], sigma, detectable(sigma, limits.confident)
         )
-    deviation = np.concatenate(deviations)
-    return data, MeasuredLidars(audits, deviation, covariance, T_lidar_base, by_errors)
+    return data, Measured(audits, deviations, covariance, by_errors, T_lidar_base)
 
 
 def freedom_of_places(places: int, lidars: int) -> float:

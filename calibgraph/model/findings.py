@@ -158,7 +158,7 @@ _NOTHING = MatcherFindings()
 
 
 def joined_metadata(tables: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """The metadata of joined tables, by theirs: the first, with what holds for all.
+    """The metadata of joined tables, by theirs, which are read: the first, with what holds for all.
 
     A common error is stated if all tables state it, as the largest. Where searches differ, only the
     cameras that one has missed remain of them, at their lowest. What images said is of one result,
@@ -168,11 +168,11 @@ def joined_metadata(tables: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     if any(one.get(IMAGES) != joined.get(IMAGES) for one in tables):
         joined[IMAGES] = _joined_images([one.get(IMAGES) for one in tables])
     for key in _COMMON:
-        stated = [one.get(key) for one in tables]
+        stated: list[Any] = [one.get(key) for one in tables]
         if None in stated:
             joined.pop(key, None)
         else:
-            joined[key] = max(stated, key=_size)
+            joined[key] = max(stated)
     searches = [{key: one.get(key) or {} for key in _OF_ONE_SEARCH} for one in tables]
     if all(one == searches[0] for one in searches):
         return joined
@@ -190,14 +190,6 @@ def _joined_images(records: Sequence[Any]) -> dict[str, list[str]]:
         name for record in known for key in ("cameras", "joined") for name in record.get(key, ())
     )
     return {"joined": sorted(map(str, {*names}))}
-
-
-def _size(value: Any) -> float:
-    """Infinite for what is no number, so that it is kept, and refused when it is read."""
-    try:
-        return float(value) if isinstance(value, (int, float)) else math.inf
-    except OverflowError:
-        return math.inf
 
 
 UNKNOWN = "unknown"

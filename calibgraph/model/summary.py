@@ -84,7 +84,7 @@ def summarize(
     moves: Sequence[str] = (),
 ) -> Summary:
     """The verdict of a rig, or of one camera, in few words."""
-    of_rig, known = rig_verdict(verdicts, named=False), sources or {}
+    of_rig, known = rig_verdict(verdicts), sources or {}
     tolerance = of_rig.error_probability.tolerance if of_rig.error_probability else TOLERANCE
     worst, others = _by_cause(verdicts)
     reasons = sorted([*_unsure(verdicts), *_findings(worst), *_nearest(verdicts)], key=_rank)

@@ -263,10 +263,10 @@ class Verdict:
         }
 
 
-def rig_verdict(cameras: Mapping[str, Verdict], *, named: bool = True) -> Verdict:
+def rig_verdict(cameras: Mapping[str, Verdict]) -> Verdict:
     """The verdict of a rig: its worst camera's, with the checks of all, named by their cameras."""
     checks = tuple(
-        replace(check, text=f"{name}: {check.text}") if named else check
+        replace(check, text=f"{name}: {check.text}")
         for name, verdict in cameras.items()
         for check in verdict.checks
     )

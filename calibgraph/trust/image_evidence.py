@@ -52,7 +52,7 @@ from calibgraph.trust.lens_parameter import (
     check_parameter,
     lens_variable,
 )
-from calibgraph.trust.pose_posterior import FrameScorer, Images
+from calibgraph.trust.pose_posterior import FrameScorer
 from calibgraph.trust.thresholds import LENS_FRAMES_BEST, LENS_Z_SCORE, threshold
 from factors import Columns, displace, fields_px
 from factors.columns import DISTORTION
@@ -85,8 +85,7 @@ def check_images(  # noqa: PLR0913 - what is checked, and by what
         scorer = FrameScorer(dataset, frames, cores)
 
         def check(name: str, camera: Camera) -> list[Check]:
-            images = scorer.load_images(name, camera)
-            each = scorer.score(images, camera, WIDE)
+            each = scorer.score(name, camera, WIDE)
             scores = concatenate_scores([one for one in each if one is not None])
             if (groups := len(scores.weights)) < MIN_GROUPS:
                 text = (
@@ -105,9 +104,9 @@ def check_images(  # noqa: PLR0913 - what is checked, and by what
             ]
             is_near = displaced >= LENS_Z_SCORE and best.mean() > LENS_FRAMES_BEST
             if lens and is_near:
-                measured = measure_lens(scorer, images, camera, scores, seed=seed, places=places)
+                measured = measure_lens(scorer, name, camera, scores, seed=seed, places=places)
                 checks += [check_parameter(one, IMAGES, tolerance) for one in measured]
-            return checks + (_check_pairing(scorer, images, camera, each) if pairing else [])
+            return checks + (_check_pairing(scorer, name, camera, each) if pairing else [])
 
         checked = pool.map(check, rig.cameras, rig.cameras.values())
         for index, name in enumerate(rig.cameras):
@@ -117,14 +116,14 @@ def check_images(  # noqa: PLR0913 - what is checked, and by what
 
 
 def _check_pairing(
-    scorer: FrameScorer, images: Images, camera: Camera, wide: Sequence[ShiftScores | None]
+    scorer: FrameScorer, name: str, camera: Camera, wide: Sequence[ShiftScores | None]
 ) -> list[Check]:
     """Whether each image agrees with its own cloud, at ``WIDE``, better than with the neighbours'.
 
     The value is the lead of its score over that with the better ones, as a share of the best. Of
     frames without neighbours there is no check.
     """
-    before, after = (scorer.score(images, camera, PAIR_LEVEL, offset=offset) for offset in (-1, 1))
+    before, after = (scorer.score(name, camera, PAIR_LEVEL, offset=offset) for offset in (-1, 1))
     own = [one and crop_grids(one, camera, PAIR_LEVEL) for one in wide]
     values = np.array([  # (3, frames) z-scores at the result; NaN where there is no such cloud
         [z_score(one, np.zeros(6)) if one and len(one.weights) else math.nan for one in all_of]
@@ -158,7 +157,7 @@ SEARCH_BLUR_STEPS = 1.0  # of the score grids, for the search only
 
 def measure_lens(  # noqa: PLR0913 - what is measured, and by what
     scorer: FrameScorer,
-    images: Images,
+    name: str,
     camera: Camera,
     scores: ShiftScores,
     *,
@@ -184,14 +183,14 @@ def measure_lens(  # noqa: PLR0913 - what is measured, and by what
     most = MAX_RADIAL / lens.free.sigmas[Free.RADIAL]
     moved[Free.RADIAL] = np.clip(moved[Free.RADIAL], -most, most)
     refined = lens.put_into(apply_twist(camera, change.twist), moved)
-    again = _with_lens(scorer, refined, scorer.score_together(images, refined, FINER))
+    again = _with_lens(scorer, refined, scorer.score_together(name, refined, FINER))
     rest = _fit_at_peaks(scorer, refined, again, np.zeros(len(best)), places=places)
     if rest is None:
         return ()
     fine, units, parameters = rest.counted_from(moved), np.array(lens.free.sigmas), []
-    for name, number in zip(NAMES, searched, strict=True):
+    for what, number in zip(NAMES, searched, strict=True):
         fit, others = fine if number in finer else rough, [n for n in finer if n != number]
-        of = LensParameter.of(name, units[[number]], fit.free(*others, number))
+        of = LensParameter.of(what, units[[number]], fit.free(*others, number))
         parameters.append(of)
     return tuple(parameters)
 

@@ -30,7 +30,6 @@ from calibgraph.io.dataset import Dataset, spread_out
 from calibgraph.io.frame import Frame
 from calibgraph.matching.structure.consensus import FAR, log_likelihood
 from calibgraph.matching.structure.frame_cache import FrameCache, cache_of
-from calibgraph.matching.structure.prepared_image import PreparedImage
 from calibgraph.matching.structure.schedule import Level
 from calibgraph.matching.structure.shift_scores import (
     ShiftScores,
@@ -57,15 +56,12 @@ TIED = 0.1
 """Share of ``REACH`` below which a relative pose ties two cameras: they are elsewhere together."""
 
 
-Images = Sequence[PreparedImage]
-"""Images of one camera, one per frame."""
-
 MAX_WINDOWS, SHARING_FRAMES = 10_000, 10
 """Per camera over that many frames; with more frames, as many each."""
 
 
 class FrameScorer:
-    """Scores frames in parallel; clouds are decoded once."""
+    """Scores frames in parallel; images and clouds are decoded once."""
 
     def __init__(self, dataset: Dataset, frames: Sequence[Frame], pool: ThreadPoolExecutor) -> None:
         self.frames = frames
@@ -73,34 +69,25 @@ class FrameScorer:
         self._pool = pool
         self._cache = cache_of(frames, FrameCache())
 
-    def load_images(self, name: str, camera: Camera) -> list[PreparedImage]:
-        """Images of a camera, one per frame."""
-        load = partial(self._cache.image, name=name, camera=camera)
-        return list(self._pool.map(load, self.frames))
-
     def score(
-        self, images: Images, camera: Camera, level: Level, *, offset: int = 0
+        self, name: str, camera: Camera, level: Level, *, offset: int = 0
     ) -> list[ShiftScores | None]:
-        """Score each image against the cloud ``offset`` frames later; None where there is none."""
-        one = partial(self._score_frame, camera=camera, level=level, offset=offset)
-        return list(self._pool.map(one, images, self.frames))
-
-    def score_together(self, images: Images, camera: Camera, level: Level) -> ShiftScores:
-        """Score all images against their own clouds."""
-        scores = self.score(images, camera, level)
-        return concatenate_scores([each for each in scores if each is not None])
-
-    def _score_frame(
-        self, image: PreparedImage, frame: Frame, *, camera: Camera, level: Level, offset: int
-    ) -> ShiftScores | None:
-        other = self.dataset.neighbour(frame, offset) if offset else frame
-        if other is None:
-            return None
+        """Score a camera's images against the clouds ``offset`` frames later, None without one."""
         most = MAX_WINDOWS // min(len(self.frames), SHARING_FRAMES)
-        cloud, twist = self._cache.cloud(other), other.twist_per_s
-        return score_frame(
-            image, cloud, camera, level, frame=frame.index, max_windows=most, twist_per_s=twist
-        )
+
+        def score(frame: Frame) -> ShiftScores | None:
+            other = self.dataset.neighbour(frame, offset) if offset else frame
+            return None if other is None else score_frame(
+                self._cache.image(frame, name, camera), self._cache.cloud(other), camera, level,
+                frame=frame.index, max_windows=most, twist_per_s=other.twist_per_s,
+            )  # fmt: skip
+
+        return list(self._pool.map(score, self.frames))
+
+    def score_together(self, name: str, camera: Camera, level: Level) -> ShiftScores:
+        """Score all images against their own clouds."""
+        scores = self.score(name, camera, level)
+        return concatenate_scores([each for each in scores if each is not None])
 
 
 def _read_samples(value: Any) -> Any:
@@ -197,7 +184,7 @@ def measure_posteriors(
             T, terms = rig.T_camera_lidar, []
             for name in group:
                 camera = rig.cameras[name]
-                scores = scorer.score_together(scorer.load_images(name, camera), camera, FAR)
+                scores = scorer.score_together(name, camera, FAR)
                 Ad = gtsam.Pose3(relative_transform(T[name], T[group[0]])).AdjointMap()
                 terms.append((log_likelihood(scores), Ad))
 

@@ -46,11 +46,8 @@ def measure(camera: Camera) -> tuple[LensParameter, ...]:
     dataset = calibgraph.load_dataset(SAMPLE, Rig(cameras={NAME: camera}))
     with ThreadPoolExecutor(2) as pool:
         scorer = FrameScorer(dataset, dataset.frames, pool)
-        images = scorer.load_images(NAME, camera)
-        scores = scorer.score_together(images, camera, WIDE)
-        return measure_lens(
-            scorer, images, camera, scores, seed=0, places=Places(stationary=((0,),))
-        )
+        scores = scorer.score_together(NAME, camera, WIDE)
+        return measure_lens(scorer, NAME, camera, scores, seed=0, places=Places(stationary=((0,),)))
 
 
 @pytest.mark.parametrize(

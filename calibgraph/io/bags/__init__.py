@@ -14,7 +14,7 @@ from calibgraph.errors import FileError
 from calibgraph.io.bags.messages import MESSAGE_SUFFIX as MESSAGE_SUFFIX
 from calibgraph.io.bags.messages import read_message
 from calibgraph.io.bags.pictures import image_from_message
-from calibgraph.io.bags.point_clouds import cloud_from_message, timed_points_of
+from calibgraph.io.bags.point_clouds import points_of
 from calibgraph.io.bags.storage import BagOptions as BagOptions
 from calibgraph.io.bags.storage import is_bag as is_bag
 from calibgraph.io.bags.transforms import stamp_ns_of
@@ -28,10 +28,7 @@ def load_bag_cloud(
     They are seconds after a stamp, by default its own; None if points have no times.
     """
     content = read_message(path)[1]
-    if timed:
-        cloud, times_s = timed_points_of(content, str(path))
-    else:
-        cloud, times_s = cloud_from_message(content, str(path)), None
+    cloud, times_s = points_of(content, str(path), timed=timed)
     if not len(cloud):
         raise FileError(path, "holds no point")
     if times_s is not None and start_ns is not None:
@@ -41,7 +38,7 @@ def load_bag_cloud(
 
 def scan_duration_s(path: Path) -> float | None:
     """Seconds between the first and the last point of a cloud in a message; None without times."""
-    times_s = timed_points_of(read_message(path)[1], str(path))[1]
+    times_s = points_of(read_message(path)[1], str(path), timed=True)[1]
     return None if times_s is None or not len(times_s) else float(np.ptp(times_s))
 
 

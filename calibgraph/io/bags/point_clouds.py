@@ -31,33 +31,27 @@ def cloud_from_message(message: Any, where: str = "") -> NDArray[np.float32]:
     Raises:
         DatasetError: if it has no x y z, or less data than it declares.
     """
-    cloud, returned = _all_points(message, where or describe_message(message))
-    return np.asarray(cloud[returned], dtype=np.float32)
+    return points_of(message, where or describe_message(message))[0]
 
 
-def timed_points_of(message: Any, where: str) -> tuple[NDArray[np.float32], Array | None]:
-    """The points of a message that are returns, and when each was taken.
+def points_of(
+    message: Any, where: str, *, timed: bool = False
+) -> tuple[NDArray[np.float32], Array | None]:
+    """The points of a message that are returns, and if asked when each was taken.
 
     Returns:
         (n, 4) as of :func:`cloud_from_message`; (n,) seconds after the stamp, None without times.
     """
-    cloud, returned = _all_points(message, where)
-    points = np.asarray(cloud[returned], dtype=np.float32)
-    names = time_fields(each.name for each in message.fields)
-    if not names:
-        return points, None
-    times = _structured(message, where, names[:1])[names[0]][returned]
-    return points, seconds_after(stamp_ns_of(message), times, f"{where}: {names[0]}")
-
-
-def _all_points(message: Any, where: str) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """(n, 4) all points, and (n,) which are returns."""
-    points = _structured(message, where)
-    cloud = make_cloud(*(points[name] for name in points.dtype.names or ()))
+    fields = _structured(message, where)
+    cloud = make_cloud(*(fields[name] for name in fields.dtype.names or ()))
     xyz = cloud[:, :3]
     with np.errstate(invalid="ignore"):  # a signalling NaN
-        returned: NDArray[np.bool_] = np.isfinite(xyz).all(axis=1) & (xyz != 0).any(axis=1)
-    return cloud, returned
+        returned = np.isfinite(xyz).all(axis=1) & (xyz != 0).any(axis=1)
+    names = time_fields(each.name for each in message.fields)[:1] if timed else []
+    for name in names:
+        times = _structured(message, where, names)[name][returned]
+        return cloud[returned], seconds_after(stamp_ns_of(message), times, f"{where}: {name}")
+    return cloud[returned], None
 
 
 def has_points(message: Any, where: str) -> bool:

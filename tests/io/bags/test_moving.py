@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from calibgraph import BagOptions, DatasetError, load_dataset, load_rig
-from calibgraph.io.bags.point_clouds import timed_points_of
+from calibgraph.io.bags.point_clouds import points_of
 from calibgraph.io.frame import frame_of_entry
 from calibgraph.matching import places
 from calibgraph.model.geometry import invert
@@ -228,7 +228,7 @@ def test_times_that_are_all_equal_are_named_if_motion_is_to_be_corrected(
 def test_times_of_all_drivers_are_read(kind: str, values: list[float]) -> None:
     rows = np.ones(2, [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("timestamp", kind)])
     rows["timestamp"] = values
-    _, times = timed_points_of(MAKE.cloud(rows, START_NS), "here")
+    _, times = points_of(MAKE.cloud(rows, START_NS), "here", timed=True)
     np.testing.assert_allclose(times, [0.0, 0.05], atol=1e-6)  # float64 stamps: 0.2 us
 
 
@@ -236,4 +236,4 @@ def test_times_that_are_none_are_refused() -> None:
     rows = np.ones(2, [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("time", "<f4")])
     rows["time"] = 7.0, np.nan
     with pytest.raises(DatasetError, match="time: times from .* are not those of one scan"):
-        timed_points_of(MAKE.cloud(rows, START_NS), "here")
+        points_of(MAKE.cloud(rows, START_NS), "here", timed=True)
