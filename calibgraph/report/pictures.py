@@ -22,10 +22,23 @@ from calibgraph.model.geometry import move_points
 from calibgraph.model.rig import Camera
 from calibgraph.model.verdict import Status
 
+Image = NDArray[np.uint8]
+
+DEPTH_RANGE_M, _TICKS_M = (2.0, 60.0), (2, 5, 10, 20, 50)
+_MAX_WIDTH_PX = 1280  # of a file, so that those of many cameras stay small
+_BAR_PX = 34
+_COVERED_SHARE = 0.2  # of the image, covered by points
+_MAX_DOT_PX = 7
+_MARKS: dict[Status, str] = {"PASS": "PASS", "WARN": "WARN", "FAIL": "FAIL, do not use"}
 _PICTURES_BYTES = 3_000_000  # of all pictures together; base64 adds a third
 _SIZES = ((1100, 80), (1100, 70), (960, 65), (800, 60), (640, 60), (480, 50), (320, 40))
 _HEIGHT_PX = 640  # at most, so that a picture and its caption fit on a screen
 _STOPS = 17  # of the scale's gradient
+
+# RGB colours that the colour-blind can tell apart (Okabe and Ito), the base first; then again.
+_COLOURS = ("#000000", "#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+_REACH_M, _ASIDE_M, _LOW_M, _HIGH_M = 25.0, 2.0, -0.3, 0.5  # of a picture; of its side view
+_TOP_PX, _SIDE_PX, _LINE_M, _LINE = (500, 500), (1000, 160), 10.0, (225, 225, 225)
 
 
 def encode(picture: NDArray[np.uint8], kind: str, *options: int) -> bytes:
@@ -99,16 +112,6 @@ def _to_jpeg(image: NDArray[np.uint8], budget: int) -> str:
         if len(data) <= budget:
             break
     return data_uri(data, "jpeg")
-
-
-Image = NDArray[np.uint8]
-
-DEPTH_RANGE_M, _TICKS_M = (2.0, 60.0), (2, 5, 10, 20, 50)
-_MAX_WIDTH_PX = 1280  # of a file, so that those of many cameras stay small
-_BAR_PX = 34
-_COVERED_SHARE = 0.2  # of the image, covered by points
-_MAX_DOT_PX = 7
-_MARKS: dict[Status, str] = {"PASS": "PASS", "WARN": "WARN", "FAIL": "FAIL, do not use"}
 
 
 def write_overlays(
@@ -203,12 +206,6 @@ def shrink(image: Image, max_width_px: int) -> Image:
         return image
     size = (max_width_px, max(1, round(image.shape[0] * factor)))
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-
-
-# RGB colours that the colour-blind can tell apart (Okabe and Ito), the base first; then again.
-_COLOURS = ("#000000", "#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-_REACH_M, _ASIDE_M, _LOW_M, _HIGH_M = 25.0, 2.0, -0.3, 0.5  # of a picture; of its side view
-_TOP_PX, _SIDE_PX, _LINE_M, _LINE = (500, 500), (1000, 160), 10.0, (225, 225, 225)
 
 
 class LidarViews(NamedTuple):

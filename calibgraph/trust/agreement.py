@@ -133,9 +133,8 @@ def check_competing_solution(solution: Solution, camera: str) -> Check:
     ours = block.within_gate(solution.T_camera_lidar[camera], gate_px)
     left_out = block.block.select(~ours)
     T, seen_by = None, solution.rig.cameras[camera]
-    fewest = row.warn * int(ours.sum())
-    if len(left_out) >= fewest > 0:
-        iterations = _ransac_iterations(fewest, len(left_out))
+    if len(left_out):
+        iterations = _ransac_iterations(row.warn * int(ours.sum()), len(left_out))
         T = frame_pose(seen_by, left_out, solution.config, iterations=iterations)
     if T is None:
         return row.check(0.0, f"{row.name}: none")

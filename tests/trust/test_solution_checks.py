@@ -74,6 +74,22 @@ def test_a_competing_solution_just_large_enough_for_a_warning_is_found(pair: Rig
             assert check_competing_solution(solved, camera).value > 0.25
 
 
+def test_a_competing_solution_may_share_most_matches(pair: Rig) -> None:
+    """Far points fit both; near ones decide, and nearly as many of them fit the other."""
+    shift = np.zeros((4, 4))
+    shift[0, 3] = 0.6
+    other = pair.moved_to({name: T + shift for name, T in pair.T_camera_lidar.items()})
+    clean = MatcherErrors(noise_px=1.0)
+    parts = [
+        simulated(rig, frames=6, matches=matches, errors=clean, depth_m=depth_m, seed=seed)
+        for seed, (rig, matches, depth_m) in enumerate(
+            [(pair, 200, (800.0, 1500.0)), (pair, 20, (5.0, 20.0)), (other, 14, (5.0, 20.0))]
+        )
+    ]
+    check = check_competing_solution(solve_joint(pair, concatenate(parts)), "left")
+    assert check.value > 0.25
+
+
 def test_random_outliers_are_no_competing_solution(pair: Rig) -> None:
     errors = MatcherErrors(outlier_share=0.5)
     solved = solve_joint(pair, simulated(pair, errors=errors))
