@@ -128,9 +128,9 @@ Datasets = Annotated[
     list[Path],
     Argument(
         metavar="DATASET...",
-        help="Dataset folder (rig.yaml, lidar/ or lidars/NAME/, cameras/NAME/), KITTI odometry "
-        "sequence or raw drive, nuScenes folder or scene, or ROS bag; several of one rig are "
-        "calibrated together.",
+        help="Dataset folder (rig.yaml, lidar/ or lidars/NAME/, cameras/NAME/), KITTI sequence or "
+        "raw drive, nuScenes folder or scene, Argoverse 2 log, or ROS bag; several of one rig "
+        "together.",
     ),
 ]
 RigFile = Annotated[
