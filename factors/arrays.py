@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Self, TypeVar
 
@@ -16,6 +17,7 @@ Array = NDArray[np.float64]
 _Number = TypeVar("_Number", bound=np.generic)
 
 _LEAST = 1e-14  # of the largest eigenvalue: below, a direction counts as free
+_REGULAR = 1e-10  # least share of an unknown that those before it leave, for Cholesky's root
 
 
 @dataclass(frozen=True)
@@ -169,17 +171,23 @@ def to_runs(edges: NDArray[np.int64]) -> NDArray[np.int64]:
 def square_root(sums: BlockSums) -> tuple[Array, Array]:
     """(n + 1,) error and (n + 1, n) Jacobian with the given H, b and c; H may be rank deficient.
 
-    H is scaled to a unit diagonal before its root is taken, so that radians and metres lose no
-    digits to each other. The root is by the eigenvectors; directions without information get a zero
-    row.
+    By Cholesky's root. Where H is nearly rank deficient, it is by the eigenvectors of H with a unit
+    diagonal, so that radians and metres lose no digits to each other, and directions without
+    information get a zero row.
     """
-    size = len(sums.gradient)
+    size, hessian = len(sums.gradient), sums.hessian
     error, jacobian = np.zeros(size + 1), np.zeros((size + 1, size))
-    scaled, units = unit_diagonal(sums.hessian)
-    values, vectors = np.linalg.eigh(scaled)
-    known = values > _LEAST * max(values[-1], 0.0)
-    roots, pulls = np.sqrt(values[known]), vectors.T[known] @ (sums.gradient / units)
-    error[:size][known] = pulls / roots
+    root = None
+    with suppress(np.linalg.LinAlgError):
+        root = np.linalg.cholesky(hessian)
+    if root is not None and (root.diagonal() ** 2 > _REGULAR * hessian.diagonal()).all():
+        error[:size], jacobian[:size] = np.linalg.solve(root, sums.gradient), root.T
+    else:
+        scaled, units = unit_diagonal(hessian)
+        values, vectors = np.linalg.eigh(scaled)
+        known = values > _LEAST * max(values[-1], 0.0)
+        roots, pulls = np.sqrt(values[known]), vectors.T[known] @ (sums.gradient / units)
+        error[:size][known] = pulls / roots
+        jacobian[:size][known] = (vectors.T[known] * roots[:, None]) * units
     error[size] = math.sqrt(max(float(sums.cost) - float(error @ error), 0.0))
-    jacobian[:size][known] = (vectors.T[known] * roots[:, None]) * units
     return error, jacobian

@@ -201,11 +201,12 @@ def best_in_cell(
         (k,) the rows that are kept, sorted by camera and frame.
     """
     sizes = np.array([[c.width_px, c.height_px] for c in rig.cameras.values()], dtype=np.float64)
-    shape = np.array([config.grid_columns, config.grid_rows], dtype=np.float64)
     among = np.ones(len(table), dtype=np.bool_) if among is None else among
-    place = (table.pixels_px + 0.5) / sizes.take(camera, axis=0) * shape
-    column, row = np.clip(place, 0.0, shape - 1.0).astype(np.int64).T  # the edge cells go on
-    cell, cells = config.grid_columns * row + column, config.grid_columns * config.grid_rows
+    cell, cells = np.zeros(len(table), np.int64), config.grid_columns * config.grid_rows
+    for axis, count in ((1, config.grid_rows), (0, config.grid_columns)):
+        place = (table.pixels_px[:, axis] + 0.5) / sizes[:, axis].take(camera) * count
+        place = np.minimum(np.maximum(place, 0.0), count - 1.0)  # from outside into edge cells
+        cell = count * cell + place.astype(np.int64)
     if _are_sorted(camera, table.frame):
         edges = frame_edges(camera, table.frame)
         return np.flatnonzero(_best_of_runs(edges, cells, cell, table.confidence, among))
