@@ -307,9 +307,9 @@ class Camera(_Model):
 
     def in_image(self, pixels_px: Array) -> NDArray[np.bool_]:
         """Which of (n, 2) pixels lie on the image."""
-        size = np.array([self.width_px, self.height_px])
-        cells = np.floor(pixels_px + 0.5)  # pixel (0, 0) is the centre of the top-left cell
-        return np.asarray(((cells >= 0) & (cells < size)).all(axis=1))
+        u, v = pixels_px.T  # pixel (0, 0) is the centre of the top-left cell
+        across = (u >= -0.5) & (u < self.width_px - 0.5)  # noqa: PLR2004
+        return np.asarray(across & (v >= -0.5) & (v < self.height_px - 0.5))  # noqa: PLR2004
 
 
 class RelativePose(_Model):

@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibgraph.arrays import Array, Mask
+from calibgraph.model.geometry import move_points
 from calibgraph.model.rig import Camera
 
 Rows = NDArray[np.intp]
@@ -62,11 +63,13 @@ def thin(angles: Array, cell_rad: float) -> Rows:
 
 def name_cells(places: Array) -> NDArray[np.int64]:
     """(n,) a number per cell of places (n, k) on a grid of step 1, in the order of the columns."""
-    cells = np.floor(places).astype(np.int64)
-    if not len(cells):
-        return np.empty(0, np.int64)
-    cells -= cells.min(axis=0)
-    return np.asarray(np.ravel_multi_index(tuple(cells.T), tuple(cells.max(axis=0) + 1)))
+    named = np.zeros(len(places), np.int64)
+    for column in places.T:  # a third of the time of ravel_multi_index
+        cell = np.floor(column).astype(np.int64)
+        cell -= cell.min(initial=0)
+        named *= cell.max(initial=0) + 1
+        named += cell
+    return named
 
 
 def _nearest_in_cells(places: Array, distance: Array) -> tuple[NDArray[np.int64], Array]:
@@ -89,11 +92,13 @@ def find_in_view(points_lidar_m: Array, camera: Camera) -> tuple[Rows, Array, Ar
         distances from the camera [m].
     """
     T = camera.T_camera_lidar
-    in_camera_m = points_lidar_m @ T[:3, :3].T + T[:3, 3]
-    ahead = np.flatnonzero((in_camera_m[:, 2] > 0) | (camera.model != "pinhole"))
-    pixels, valid = camera.lens.project(in_camera_m[ahead])
-    rows = ahead[valid & camera.in_image(pixels)]
-    return rows, view_angles(in_camera_m[rows]), np.linalg.norm(in_camera_m[rows], axis=1)
+    behind = points_lidar_m @ T[2, :3] <= -T[2, 3]
+    rows = np.flatnonzero(~behind | (camera.model != "pinhole"))
+    points_m = points_lidar_m.take(rows, axis=0)
+    pixels, valid = camera.lens.project(points_m, T)
+    seen = np.flatnonzero(valid & camera.in_image(pixels))
+    seen_m = move_points(points_m.take(seen, axis=0), T)
+    return rows[seen], view_angles(seen_m), np.sqrt(np.einsum("ni,ni->n", seen_m, seen_m))
 
 
 def find_visible(angles: Array, distance_m: Array, cell_rad: float) -> Mask:
