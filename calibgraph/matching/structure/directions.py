@@ -15,7 +15,7 @@ HIDDEN_RATIO, HIDDEN_M = 1.15, 0.3  # a point farther than this beyond the neare
 def view_angles(points_camera_m: Array) -> Array:
     """(n, 2) angles [rad] to the right of, and below, the camera's axis; for any field of view."""
     x, y, z = points_camera_m.T
-    return np.column_stack([np.arctan2(x, z), np.arctan2(y, np.hypot(x, z))])
+    return np.stack([np.arctan2(x, z), np.arctan2(y, np.hypot(x, z))]).T
 
 
 def scan_angles(angles: Array) -> Array:
@@ -27,7 +27,7 @@ def scan_angles(angles: Array) -> Array:
         angles: (n, 2) see :func:`sphere_angles`.
     """
     azimuth, elevation = angles.T
-    return np.column_stack([azimuth * np.cos(elevation), elevation])
+    return np.stack([azimuth * np.cos(elevation), elevation]).T
 
 
 def sphere_angles(rays_m: Array) -> Array:
@@ -37,7 +37,7 @@ def sphere_angles(rays_m: Array) -> Array:
         rays_m: (n, 3) from the viewpoint, along the axes of the LiDAR frame.
     """
     x, y, z = np.asarray(rays_m, dtype=np.float64).T
-    return np.column_stack([np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))])
+    return np.stack([np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))]).T
 
 
 def thin(angles: Array, cell_rad: float) -> Rows:
@@ -56,7 +56,7 @@ def thin(angles: Array, cell_rad: float) -> Rows:
     row = np.floor(up)
     along = (angles[:, 0] + np.pi) * np.cos((row + 0.5) * cell_rad) / cell_rad
     off = (along - np.floor(along) - 0.5) ** 2 + (up - row - 0.5) ** 2
-    cells, nearest = _nearest_in_cells(np.column_stack([up, along]), off)
+    cells, nearest = _nearest_in_cells(np.stack([up, along]).T, off)
     rows = np.flatnonzero(off == nearest)
     return rows[np.unique(cells[rows], return_index=True)[1]]  # of equally near ones, the first
 
