@@ -111,7 +111,7 @@ def match(
     data = dataset_from(dataset, rig, frames, bag, interval_s=interval_s)
     limit_s = time_limit_of(matcher, time_limit_s)
     with progress_bar() as progress:
-        if data.rig.other_lidars:  # as of calibrate
+        if data.rig.require_cameras().other_lidars:  # as of calibrate
             data, *_ = find_lidars(data, data.rig, chosen, settings, progress=progress)
         run = match_in_rounds(data, matcher=chosen, time_limit_s=limit_s, progress=progress)
         run.correspondences.save(out)

@@ -248,7 +248,7 @@ def image_from_above(points: Array, cells: int, cell_m: float, most: float = np.
     image = np.sqrt(np.minimum(counts, most)).reshape(cells, cells)
     image = np.asarray(cv2.GaussianBlur(image, (0, 0), 1.0), dtype=np.float64)
     image -= image.mean()
-    return np.asarray(image / max(float(np.linalg.norm(image)), _TINY))
+    return np.asarray(image / max(cv2.norm(image), _TINY))
 
 
 def _correlate(known: UprightCloud, now: UprightCloud, turn: int) -> tuple[float, Array]:

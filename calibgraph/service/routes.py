@@ -79,7 +79,7 @@ _FORM = {"type": "object", "properties": _PARTS | dict.fromkeys(TEXTS, {"type": 
 async def submit(kind: JobKind, request: Request, response: Response, state: State) -> JobRecord:
     """Ask for a job: a form with files, and settings as JSON."""
     size = int(request.headers.get("content-length", "0"))
-    await run_in_threadpool(state.require_room, size)
+    await run_in_threadpool(state.require_turn, size)
     record = await _receive_job(request, kind, state)
     response.headers["Location"] = f"/v1/jobs/{record.id}"
     return _answer(record, state)

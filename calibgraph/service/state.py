@@ -114,6 +114,13 @@ class Service:
             self._remove_expired()
             raise Problem(507, "the server's disk has no room for it; try again later")
 
+    def require_turn(self, size: int) -> None:
+        """Refuse a job whose form has so many bytes, if there is no room or too many wait."""
+        self.require_room(size)
+        waiting = self.jobs.counts().get("queued", 0)
+        if waiting >= self.settings.most_queued:
+            raise Problem(429, f"{waiting} jobs wait already; try again later")
+
     def of_job(self, id: str) -> Path:
         """The folder of a job."""
         return self.path / "jobs" / id
@@ -127,9 +134,6 @@ class Service:
         arrived.rename(self.of_job(id))
         try:
             sync_to_disk(self.of_job(""))
-            waiting = self.jobs.counts().get("queued", 0)
-            if waiting >= self.settings.most_queued:
-                raise Problem(429, f"{waiting} jobs wait already; try again later")
             record = self.jobs.add(id, job)
         except BaseException:
             shutil.rmtree(self.of_job(id), ignore_errors=True)

@@ -122,10 +122,6 @@ class World:
     file_lines: list[str]  # of whole files, whose frames come together
 
 
-class Crashed(BaseException):
-    """As good as a kill: nothing is saved on the way out."""
-
-
 def track_draw(drawn: Drawn) -> Calibration:
     """The last estimate of a tracker that is given the frames of a draw."""
     tracker = IncrementalCalibrator(drawn.rig, Config())

@@ -82,6 +82,7 @@ def test_clouds_are_those_of_each_lidar_in_its_own_frame(lower: str, tmp_path: P
     assert frame.hashes().keys() == {str(frame.cloud_path), str(frame.lidar_paths["down_lidar"])}
 
 
+@pytest.mark.slow
 def test_stated_extrinsics_that_are_wrong_are_found(tmp_path: Path):
     write_log(tmp_path / "log", "up_lidar")
     result = calibgraph.calibrate(tmp_path / "log" / "up_lidar")

@@ -104,6 +104,7 @@ def write_consecutive(folder: Path, sweeps: int) -> Path:
     return write_rig(folder, "top", {"front": MOUNTS["front"]})
 
 
+@pytest.mark.slow
 def test_the_motion_is_found_from_consecutive_clouds(tmp_path, caplog):
     folder = write_consecutive(tmp_path, 3)
     with caplog.at_level(logging.WARNING):
