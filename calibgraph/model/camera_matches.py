@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.arrays import Array
+from calibgraph.arrays import Array, name_cells
 from calibgraph.model.correspondences import CAMERA_INDEX, MAX_COORDINATE, Column, Table
 
 if TYPE_CHECKING:
@@ -74,7 +74,8 @@ class CameraMatches(Table):
 
     def pairs(self) -> list[tuple[str, str]]:
         """The pairs of cameras that have matches, A before B."""
-        return [(self.cameras[a], self.cameras[b]) for a, b in np.unique(self.camera_index, axis=0)]
+        first = np.unique(name_cells(self.camera_index), return_index=True)[1]
+        return [(self.cameras[a], self.cameras[b]) for a, b in self.camera_index[first]]
 
     def of_pair(self, a: str, b: str) -> CameraMatches:
         """The rows of one pair, A and B in the order of ``cameras``; none if it has none."""

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
-from calibgraph.arrays import Array
+from calibgraph.arrays import Array, name_cells
 from calibgraph.errors import CalibrationError
 from calibgraph.io.dataset import Dataset, spread_out
 from calibgraph.io.frame import Frame
@@ -209,9 +209,8 @@ def _cells(camera: Camera, cloud: Cloud) -> int:
     """How many cells of the image have points."""
     pixels, seen = camera.lens.project(cloud[:, :3].astype(np.float64), camera.T_camera_lidar)
     size = np.array([camera.width_px, camera.height_px])
-    cells = np.floor((pixels[seen] + 0.5) / size * _CELLS).astype(np.int64)
-    inside = ((cells >= 0) & (cells < _CELLS)).all(axis=1)
-    return len(np.unique(cells[inside], axis=0))
+    inside = pixels[seen & camera.in_image(pixels)]
+    return len(np.unique(name_cells((inside + 0.5) / size * _CELLS)))
 
 
 def joint_covariance(cameras: Array, by_lidars: Array, lidars: Array, root: Array) -> Array:

@@ -217,7 +217,7 @@ def _nearest(planes: Sequence[Sequence[Planes]], T_base_lidar: Array) -> Matches
     found = [np.empty(0, MATCH)]
     for place, seen in enumerate(zip(*planes, strict=True)):
         here = [moved(own, T) for own, T in zip(seen, T_base_lidar, strict=True)]
-        trees = [cKDTree(own["center_m"]) for own in here]
+        trees = [cKDTree(own["center_m"], balanced_tree=False) for own in here]
         for one, other in permutations(range(len(here)), 2):
             away, nearest = trees[other].query(here[one]["center_m"], distance_upper_bound=_REACH_M)
             rows = np.flatnonzero(np.isfinite(away))

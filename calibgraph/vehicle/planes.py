@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from calibgraph.arrays import Array
+from calibgraph.arrays import Array, name_cells
 from calibgraph.model.geometry import move_points
 
 _NEAREST_M, _FARTHEST_M = 1.0, 80.0  # the vehicle itself, and where planes are too few to match
@@ -96,8 +96,8 @@ def _seeds(points: Array) -> Array:
     """(s, 3) points, one of each cell, whose size grows with the range; of many, a selection."""
     size = np.clip(_SHARES[0] * np.linalg.norm(points, axis=1), 0.25, 1.0)
     steps = np.round(2 * np.log2(size))
-    cells = np.column_stack([steps, np.floor(points / 2 ** (steps / 2)[:, None])]).astype(np.int64)
-    first = np.unique(cells, axis=0, return_index=True)[1]
+    cells = name_cells(np.column_stack([steps, points / 2 ** (steps / 2)[:, None]]))
+    first = np.unique(cells, return_index=True)[1]
     step = -(-len(first) // _MOST)
     return np.asarray(points[first[:: step or 1]])
 

@@ -71,19 +71,21 @@ class Sums:
 
 def sum_up(matches: Matches, T_base_lidar: Array, scale_m: float) -> Sums:
     """The sums with the weights of a Cauchy loss of a width [m], at poses (k, 4, 4)."""
-    twists, rows = step_twists(T_base_lidar), []
+    twists, rows, count = step_twists(T_base_lidar), [], len(T_base_lidar)
     steps, metric = twists.reshape(-1, 6, len(twists)), np.zeros_like(twists)
-    both = np.sort(np.column_stack([matches["one"], matches["other"]]), axis=1)
-    pairs = np.column_stack([matches["place"], both])
-    for pair in np.unique(pairs, axis=0):
-        place, one, other = pair.tolist()
-        own = matches[(pairs == pair).all(axis=1)]
-        cells, hessian, gradient, whole = _of_pair(own, one, scale_m)
+    cells = np.floor(matches["plane"]["center_m"] / CELL_M).astype(np.int64) @ _CELL_NUMBERS
+    low, high = np.sort([matches["one"], matches["other"]], axis=0)
+    pairs = (matches["place"] * count + low) * count + high
+    order = np.lexsort((cells, pairs))
+    starts = np.flatnonzero(np.diff(pairs[order], prepend=-1))
+    for own in np.split(order, starts[1:]):
+        place, one, other = matches["place"][own[0]], low[own[0]], high[own[0]]
+        named, hessian, gradient, whole = _of_pair(matches[own], cells[own], one, scale_m)
         by = steps[one] - steps[other]
         metric += by.T @ whole @ by
         kept = _reliable(hessian.sum(axis=0), whole)
         by = kept @ by
-        rows.append((np.full(len(cells), place), cells, by.T @ hessian @ by, gradient @ by))
+        rows.append((np.full(len(named), place), named, by.T @ hessian @ by, gradient @ by))
     places, cells, hessians, gradients = map(np.concatenate, zip(*rows, strict=True))
     row = np.unique(places * _PLACE_NUMBER + cells, return_inverse=True)[1]
     hessian, gradient = _added(row.ravel(), hessians), _added(row.ravel(), gradients)
@@ -101,34 +103,44 @@ def step_twists(T_base_lidar: Array) -> Array:
     return np.asarray(scipy.linalg.block_diag(*adjoints(shifts)))
 
 
-def _cross_matrix(vectors: Array) -> Array:
-    """(n, 3, 3) of (n, 3), with matrix @ x = vector cross x."""
-    return np.cross(np.eye(3), vectors[:, None])
-
-
 def _of_pair(
-    own: Matches, one: int, scale_m: float
+    own: Matches, cells: NDArray[np.int64], one: int, scale_m: float
 ) -> tuple[NDArray[np.int64], Array, Array, Array]:
     """Numbers of cells (c,), their H (c, 6, 6) and g (c, 6) by the twist of one against the other.
 
-    And H of all, (6, 6), as if normals did not err.
+    And H of all, (6, 6), as if normals did not err. Matches come by their cells (m,).
     """
     plane, other, (by_other, by_own) = own["plane"], own["of_other"], residuals_m(own)
     points, weight = plane["center_m"], 1.0 / (1.0 + 0.5 * (by_other**2 + by_own**2) / scale_m**2)
     a = np.hstack([np.cross(points, other["normal"]), other["normal"]])
     b = np.hstack([np.cross(other["center_m"], plane["normal"]), plane["normal"]])
-    every = np.concatenate([_cross_matrix(points), np.tile(np.eye(3), (len(points), 1, 1))], 1)
-    across = every @ every.transpose(0, 2, 1) - a[:, :, None] * a[:, None, :]
-    shared = 0.5 * (plane["tilt"] ** 2 + other["tilt"] ** 2)
-    product = a[:, :, None] * b[:, None, :]
     whole = 0.5 * ((a.T * weight) @ a + (b.T * weight) @ b)
-    hessian = 0.5 * (product + product.transpose(0, 2, 1)) - shared[:, None, None] * across
+    shared = 0.5 * (plane["tilt"] ** 2 + other["tilt"] ** 2)[:, None]
+    starts = np.flatnonzero(np.diff(cells, prepend=cells[0] - 1))
+    hessian = _summed(0.5 * weight[:, None] * (b + shared * a), a, starts)
+    at = np.hstack([points, np.ones_like(shared)])
+    hessian += hessian.transpose(0, 2, 1) - _for_all_normals(
+        _summed(weight[:, None] * shared * at, at, starts)
+    )
     gradient = 0.5 * (b * by_other[:, None] + a * by_own[:, None])
     gradient *= (weight * np.where(own["one"] == one, 1.0, -1.0))[:, None]
-    cells = np.floor(points / CELL_M).astype(np.int64) @ _CELL_NUMBERS
-    named, row = np.unique(cells, return_inverse=True)
-    hessian = _added(row.ravel(), weight[:, None, None] * hessian)
-    return named, hessian, _added(row.ravel(), gradient), whole
+    return cells[starts], hessian, np.add.reduceat(gradient, starts), whole
+
+
+def _summed(a: Array, b: Array, starts: NDArray[np.int64]) -> Array:
+    """(c, k, k) sums of a b^T, of (m, k) rows from each start to the next."""
+    return np.asarray(np.add.reduceat(a[:, :, None] * b[:, None, :], starts))
+
+
+def _for_all_normals(moments: Array) -> Array:
+    """(c, 6, 6) sums of A A^T, of (c, 4, 4) those of the products of [x, 1]."""
+    out = np.zeros((len(moments), 6, 6))
+    squares, eye = moments[:, :3, :3], np.eye(3)
+    out[:, :3, :3] = squares.trace(axis1=1, axis2=2)[:, None, None] * eye - squares
+    out[:, :3, 3:] = np.cross(eye, moments[:, None, :3, 3])  # matrix @ y = x cross y
+    out[:, 3:, :3] = out[:, :3, 3:].transpose(0, 2, 1)
+    out[:, 3:, 3:] = moments[:, 3:, 3:] * eye
+    return out
 
 
 def _added(rows: NDArray[np.int64], values: Array) -> Array:

@@ -10,12 +10,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.arrays import Array
+from calibgraph.arrays import Array, name_cells
 from calibgraph.matching.structure.directions import (
     find_in_view,
     find_places,
     find_visible,
-    name_cells,
     view_angles,
 )
 from calibgraph.matching.structure.prepared_cloud import PreparedCloud
