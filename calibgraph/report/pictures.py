@@ -25,7 +25,7 @@ from calibgraph.model.verdict import Status
 Image = NDArray[np.uint8]
 
 DEPTH_RANGE_M, _TICKS_M = (2.0, 60.0), (2, 5, 10, 20, 50)
-_MAX_WIDTH_PX = 1280  # of a file, so that those of many cameras stay small
+_MAX_WIDTH_PX = 1280  # of an overlay: a rig of many cameras stays small to send
 _BAR_PX = 34
 _COVERED_SHARE = 0.2  # of the image, covered by points
 _MAX_DOT_PX = 7

@@ -115,7 +115,7 @@ class Service:
             raise Problem(507, "the server's disk has no room for it; try again later")
 
     def require_turn(self, size: int) -> None:
-        """Refuse a job whose form has so many bytes, if there is no room or too many wait."""
+        """Refuse a job if too many wait, or if its form of so many bytes has no room."""
         self.require_room(size)
         waiting = self.jobs.counts().get("queued", 0)
         if waiting >= self.settings.most_queued:

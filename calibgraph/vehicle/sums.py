@@ -108,7 +108,7 @@ def _of_pair(
 ) -> tuple[NDArray[np.int64], Array, Array, Array]:
     """Numbers of cells (c,), their H (c, 6, 6) and g (c, 6) by the twist of one against the other.
 
-    And H of all, (6, 6), as if normals did not err. Matches come by their cells (m,).
+    And H of all, (6, 6), as if normals did not err. Matches are sorted by their cells (m,).
     """
     plane, other, (by_other, by_own) = own["plane"], own["of_other"], residuals_m(own)
     points, weight = plane["center_m"], 1.0 / (1.0 + 0.5 * (by_other**2 + by_own**2) / scale_m**2)
@@ -133,7 +133,7 @@ def _summed(a: Array, b: Array, starts: NDArray[np.int64]) -> Array:
 
 
 def _for_all_normals(moments: Array) -> Array:
-    """(c, 6, 6) sums of A A^T, of (c, 4, 4) those of the products of [x, 1]."""
+    """(c, 6, 6) sums of A A^T, from the sums (c, 4, 4) of [x, 1] [x, 1]^T."""
     out = np.zeros((len(moments), 6, 6))
     squares, eye = moments[:, :3, :3], np.eye(3)
     out[:, :3, :3] = squares.trace(axis1=1, axis2=2)[:, None, None] * eye - squares

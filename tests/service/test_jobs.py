@@ -113,6 +113,7 @@ def test_a_full_queue_refuses_and_gives_a_time_and_a_waiting_job_is_cancelled_on
     at = taken.headers["location"]
     assert (taken.status_code, at) == (202, f"/v1/jobs/{taken.json()['id']}")
     assert refused.status_code == 429 and int(refused.headers["retry-after"]) > 0
+    assert client.post(SOLVE, content=b"no form").status_code == 429  # before it is read
     assert len(list((service_folder(client) / "jobs").iterdir())) == 1
     assert client.delete(at).json()["state"] == "cancelled"
     assert client.delete(at).status_code == 409

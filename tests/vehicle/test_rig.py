@@ -235,9 +235,10 @@ def test_commands_for_cameras_refuse_a_rig_of_lidars_alone(
 ):
     other = replace(result, inputs={"another": "0" * 64})
     saved = [of.save(tmp_path / str(n)).parent for n, of in enumerate((result, other))]
-    words = {
-        "match": [vehicle, "--out", tmp_path / "m.parquet"], "evaluate": saved,
-    }  # fmt: skip
+    unread = shutil.copytree(vehicle, tmp_path / "data")
+    for cloud in unread.rglob("*.npy"):
+        cloud.write_bytes(b"")
+    words = {"match": [unread, "--out", tmp_path / "m.parquet"], "evaluate": saved}
     code, out, err = call(command, *words[command])
     assert (code, out) == (2, "") and "no camera, only LiDARs (front, left, top)" in err
 

@@ -81,8 +81,8 @@ def find_in_view(points_lidar_m: Array, camera: Camera) -> tuple[Rows, Array, Ar
         distances from the camera [m].
     """
     T = camera.T_camera_lidar
-    behind = points_lidar_m @ T[2, :3] <= -T[2, 3]
-    rows = np.flatnonzero(~behind | (camera.model != "pinhole"))
+    is_ahead = points_lidar_m @ T[2, :3] > -T[2, 3]
+    rows = np.flatnonzero(is_ahead | (camera.model != "pinhole"))
     points_m = points_lidar_m.take(rows, axis=0)
     pixels, valid = camera.lens.project(points_m, T)
     seen = np.flatnonzero(valid & camera.in_image(pixels))
