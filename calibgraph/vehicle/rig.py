@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -34,7 +35,7 @@ from calibgraph.vehicle.lidars import (
 )
 from calibgraph.vehicle.motion import REACH_M, Drive, Instant
 from calibgraph.vehicle.planes import View, Views, look
-from calibgraph.vehicle.start import locate_lidars
+from calibgraph.vehicle.start import distance_between, locate_lidars
 from calibgraph.vehicle.travel import POSE_FILES, Travel, direction_of_travel, read_poses
 
 MOST_INSTANTS = 20
@@ -113,17 +114,17 @@ def calibrate_rig_lidars(
     if lost:
         progress("joining LiDARs by motion", 0, 1)
         far = {name: T for name, T in guess.items() if name not in start}
-        known = {name: T for name, T in far.items() if T is not None}
         try:
             poses, more, line = _join_by_motion(drive, instants, far, lost, base=rig.lidar)
             parts, doubts = [poses], doubts | more
         except CalibrationError:
-            if len(known) < len(far):
+            if any(T is None for T in far.values()):
                 raise
-            placed, reasons = _placed(known, place)
-            missing = {name: T for name, T in known.items() if name not in placed}
-            start, line = start | missing, f"{lost}; begun from the guess" if missing else lost
-        warnings.append(line)
+            placed, reasons = _placed(far, place)
+            missing = {name: T for name, T in far.items() if T is not None and name not in placed}
+            begun, more, line = _begin(views, guess, missing, lost, base=rig.lidar)
+            start, doubts = start | begun, doubts | more
+        warnings += filter(None, [line])
     progress("calibrating LiDARs", 0, 1)
     if start:
         try:
@@ -170,6 +171,32 @@ def _placed(
             _log.info("%s", error)
             reasons.append(f"{error}")
     return found, reasons
+
+
+def _begin(
+    views: Views, guess: Mapping[str, Array | None], missing: Mapping[str, Array], lost: str, *,
+    base: str,
+) -> tuple[dict[str, Array], dict[str, str], str]:  # fmt: skip
+    """The poses (4, 4) at which LiDARs are begun that do not fit their guess, doubts, and a line.
+
+    That is where they fit without a guess, else the guess.
+    """
+    found, doubts = dict[str, Array](), dict[str, str]()
+    if missing:
+        with suppress(CalibrationError):  # no ground
+            found, doubts, _ = locate_lidars(views, {**guess, **dict.fromkeys(missing)}, base=base)
+    for name in missing.keys() & found.keys():
+        degrees, metres = distance_between(found[name], missing[name])
+        doubts[name] = (
+            f"it does not fit its guess, but turned by {degrees:.0f} deg and moved by "
+            f"{metres:.1f} m from it: is that p_base = T_base_lidar * p_lidar, in metres, and are "
+            "the clouds its own?"
+        )
+    if missing.keys() - found.keys():
+        lost += "; begun from the guess"
+    elif missing:
+        lost = ""
+    return {name: found.get(name, T) for name, T in missing.items()}, doubts, lost
 
 
 def _look(instants: Sequence[Instant], guess: Mapping[str, Array | None], base: str) -> Views:

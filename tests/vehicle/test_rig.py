@@ -88,6 +88,19 @@ def test_a_result_is_read_as_it_was_written(result: Calibration, tmp_path: Path)
         calibgraph.load_calibration(path)
 
 
+def test_a_lidar_that_does_not_fit_its_guess_is_found_without_and_named(tmp_path: Path):
+    in_mm = MOUNTS["left"].copy()
+    in_mm[:3, 3] *= 1000.0
+    lidars = {"top": {}, "left": {"T_base_lidar": in_mm.tolist()}}
+    write_vehicle(tmp_path, seed=2, places=1, without="front", lidars=lidars)
+    found = calibgraph.calibrate(tmp_path)
+    assert np.abs(found.T_base_lidar["left"] - MOUNTS["left"]).max() < 0.01
+    assert found.verdict.status == "WARN" and not found.warnings
+    assert "it does not fit its guess, but turned by 0 deg and moved by 1" in " ".join(
+        found.verdicts["left"].reasons
+    )
+
+
 def test_the_report_has_a_table_of_lidars(result: Calibration):
     page = render_page(result)
     assert "Can this calibration of 2 LiDARs to the LiDAR top be used?" in page
