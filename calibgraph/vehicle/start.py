@@ -164,9 +164,7 @@ def _placements(
         elif np.isinf(score[heading, i, j]):
             break
         refined = _refined(known, own, start, T_up_base[2, :3])
-        found += [
-            each for each in refined if guess is None or _is_near(each.T, guess, _NEAR_DEG, _NEAR_M)
-        ]
+        found += [each for each in refined if guess is None or is_near(each.T, guess)]
         for T in (start, *(each.T for each in refined)):
             angles, shifted = away(T)
             score[(angles <= _PEAK_DEG)[:, None, None] & (shifted <= _PEAK_M)] = -np.inf
@@ -232,10 +230,10 @@ def _best(tried: Sequence[_Placement], guess: Array | None) -> tuple[_Placement,
     best = max(tried, key=lambda each: each.score, default=_Placement(0, 0.0, np.eye(4)))
     as_good = [each for each in tried if each.score >= _AS_GOOD * best.score]
     if guess is not None and any(
-        not _is_near(each.T, best.T, _OTHER_DEG, _OTHER_M) for each in as_good
+        not is_near(each.T, best.T, _OTHER_DEG, _OTHER_M) for each in as_good
     ):
         best = min(as_good, key=lambda each: np.linalg.norm(each.T[:3, 3] - guess[:3, 3]))
-    others = [each for each in as_good if not _is_near(each.T, best.T, _OTHER_DEG, _OTHER_M)]
+    others = [each for each in as_good if not is_near(each.T, best.T, _OTHER_DEG, _OTHER_M)]
     if not others:
         return best, ""
     degrees, metres = max(distance_between(each.T, best.T) for each in others)
@@ -248,5 +246,8 @@ def distance_between(T_base_lidar: Array, other: Array) -> tuple[float, float]:
     return degrees, float(np.linalg.norm(T_base_lidar[:3, 3] - other[:3, 3]))
 
 
-def _is_near(T_base_lidar: Array, other: Array, deg: float, metres: float) -> bool:
+def is_near(
+    T_base_lidar: Array, other: Array, deg: float = _NEAR_DEG, metres: float = _NEAR_M
+) -> bool:
+    """Whether a placement is near another one; by default, as near as to a guess."""
     return bool((np.array(distance_between(T_base_lidar, other)) <= (deg, metres)).all())

@@ -21,11 +21,12 @@ from calibgraph.model.geometry import transform
 from calibgraph.report.html import render_page
 from calibgraph.report.tables import print_result
 from tests.conftest import SAMPLE, Call, require_poses
-from tests.vehicle.scenes import MOUNTS, record
+from tests.vehicle.scenes import HEIGHT_M, MOUNTS, draw_place, record, scan
 
 RIG = {"format": "calibgraph-rig/1", "lidar": "top", "lidars": {name: {} for name in MOUNTS}}
 
 
+AZIMUTHS_DEG = np.arange(-180.0, 180.0, 2.0)
 SAMPLE_RIG = (SAMPLE / "rig.yaml").read_text()
 
 
@@ -99,6 +100,33 @@ def test_a_lidar_that_does_not_fit_its_guess_is_found_without_and_named(tmp_path
     assert "it does not fit its guess, but turned by 0 deg and moved by 1" in " ".join(
         found.verdicts["left"].reasons
     )
+
+
+def test_clouds_in_millimetres_are_refused(tmp_path: Path):
+    write_vehicle(tmp_path, places=1, without="front")
+    for path in (tmp_path / "lidars" / "left").iterdir():
+        np.save(path, 1000.0 * np.load(path))
+    with pytest.raises(DatasetError, match="LiDAR 'left' are farther than .* in metres"):
+        calibgraph.calibrate(tmp_path)
+
+
+def test_clouds_of_a_drive_that_are_a_frame_late_are_no_pass(tmp_path: Path):
+    rng, boxes, step = np.random.default_rng(3), draw_place(np.random.default_rng(1)), 0.2
+    for name, late in (("top", 0.0), ("left", 1.0)):
+        (tmp_path / "lidars" / name).mkdir(parents=True)
+        for number in range(2):
+            at = transform(np.eye(3), [step * (number - late), 0.0, HEIGHT_M])
+            cloud = scan(boxes, at @ MOUNTS[name], rng, beams=14, azimuths_deg=AZIMUTHS_DEG)
+            np.save(tmp_path / "lidars" / name / f"{number}.npy", cloud)
+    guess = {"T_base_lidar": MOUNTS["left"].tolist()}
+    (tmp_path / "rig.yaml").write_text(
+        yaml.safe_dump({**RIG, "lidars": {"top": {}, "left": guess}})
+    )
+    found = calibgraph.calibrate(tmp_path)
+    off = found.T_base_lidar["left"][0, 3] - MOUNTS["left"][0, 3]
+    assert abs(off) > 0.15, "the way of a frame"
+    assert found.sigmas("left")[1][0] > 100.0 * step / 2.5 and found.verdict.status == "WARN"
+    assert "moves by 20 cm from one cloud to the next" in found.warnings[0]
 
 
 def test_the_report_has_a_table_of_lidars(result: Calibration):
