@@ -252,6 +252,8 @@ def _with_clock_errors(
     That is so while the vehicle moves on steadily and is not known to move. As far as steps between
     frames differ, it shows in what places differ by. Steps are by planes of the base.
     """
+    if any(each.twist_per_s is not None for each in instants):
+        return poses, []
     pairs = [
         (i.frame, view.planes)
         for i, view in zip(instants, seen, strict=True)
@@ -260,7 +262,7 @@ def _with_clock_errors(
     ]
     steps = [_step_after(drive, *pair, poses.base) for pair in spread_out(pairs, _PAIRS)]
     known = [step for step in steps if step is not None]
-    if not known or len(known) < len(steps) or any(i.twist_per_s is not None for i in instants):
+    if not known or len(known) < len(steps):
         return poses, []
     mean, apart = np.mean(known, axis=0), poses.places * np.var(known, axis=0)[3:].sum()
     frames = (_CLOCK_FRAMES**-2 + apart / (poses.place_ratios[1] * PLACE_SIGMAS[3] ** 2)) ** -0.5
@@ -279,9 +281,9 @@ def _with_clock_errors(
 
 def _step_after(drive: Drive, number: int, planes: Planes, base: str) -> Array | None:
     """(6,) the twist of the base from a frame to the next; None if their planes do not fit."""
-    cloud = drive.instant(number + 1, [base]).at_stamp(base, np.eye(4))
-    both = [[thinned(of, _STEP_PLANES)] for of in (planes, find_planes(cloud))]
     with suppress(CalibrationError):
+        cloud = drive.instant(number + 1, [base]).at_stamp(base, np.eye(4))
+        both = [[thinned(of, _STEP_PLANES)] for of in (planes, find_planes(cloud))]
         T, _ = refine_poses(both, np.array([np.eye(4)] * 2), (base, base))
         near, on = count_matched(both, T)
         if on[0] > _STEP_SHARE * near[0]:
