@@ -211,7 +211,7 @@ def test_mirrored_images_are_named(tmp_path: Path) -> None:
     shutil.copytree(SAMPLE, copy)
     for path in (copy / "cameras" / "left").iterdir():
         cv2.imwrite(str(path), cv2.flip(cv2.imread(str(path)), 1))
-    found = likely_intended_guess(calibgraph.load_dataset(copy, frames="0:3"), rough_guess(5))
+    found = likely_intended_guess(calibgraph.load_dataset(copy, frames="0"), rough_guess(5))
     assert found is not None and found.startswith("the images of left are mirrored")
 
 
