@@ -86,7 +86,7 @@ def test_a_flat_street_leaves_the_direction_along_it_open():
         assert "determines x in top: the guess stays" in " ".join(verdict.reasons)
 
 
-@pytest.mark.parametrize("with_guess", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("with_guess", [False, True])
 def test_in_a_room_that_looks_alike_from_both_ends_a_pose_without_a_guess_is_no_pass(with_guess):
     rng, at = np.random.default_rng(10), transform(np.eye(3), [0.0, 0.0, HEIGHT_M])
     walls = np.array([[[s * 12.0 - 1.0, -8.0, 0.0], [s * 12.0 + 1.0, 8.0, 7.0]] for s in (-1, 1)])
