@@ -18,10 +18,11 @@ from calibgraph.io.dataset import Dataset, spread_out
 from calibgraph.io.frame import Frame
 from calibgraph.matching.cloud_similarity import find_upright
 from calibgraph.model.config import Config
-from calibgraph.model.geometry import move_points, transform
+from calibgraph.model.geometry import adjoints, invert, move_points, transform
 from calibgraph.model.rig import Rig, Vehicle
 from calibgraph.model.verdict import ABOUT_THE_DATA, Check, Verdict
 from calibgraph.progress import Progress
+from calibgraph.trust.corrected import LOOKED_AT, TWICE, corrected_twice
 from calibgraph.trust.probability import TABLES, judge, probability_beyond
 from calibgraph.trust.thresholds import threshold
 from calibgraph.vehicle.frame import Road, find_road, find_vehicle
@@ -144,13 +145,16 @@ def calibrate_rig_lidars(
         travel = Travel() if path is None else direction_of_travel(read_poses(path)[0])
         vehicle, unknown = find_vehicle(rig.vehicle, _road(instants, poses.T_base_lidar), travel)
         warnings += unknown
+    warnings += (twice := _corrected_twice(instants, poses.T_base_lidar))
     for line in warnings:
         _log.warning(line)
     return LidarResult(
         vehicle,
         poses,
         {
-            name: judge_lidar(poses, name, config.tolerance, doubt=doubts.get(name, ""))
+            name: judge_lidar(
+                poses, name, config.tolerance, doubt=doubts.get(name, ""), twice="; ".join(twice)
+            )
             for name in rig.other_lidars
         },
         tuple(warnings),
@@ -248,6 +252,16 @@ def _turn_by_motion(
     return transform(Rotation.align_vectors(pairs[:, 0], pairs[:, 1])[0].as_matrix())
 
 
+def _corrected_twice(instants: Sequence[Instant], T_base_lidar: Mapping[str, Array]) -> list[str]:
+    """A line per LiDAR whose clouds were corrected for motion before."""
+    moving, lines = [of for of in instants if of.twist_per_s is not None], list[str]()
+    for name, T in T_base_lidar.items():
+        turn = adjoints(invert(T)[None])[0]
+        seen = spread_out(moving, LOOKED_AT)
+        lines.append(corrected_twice(((i.returns[name], turn @ i.twist_per_s) for i in seen), name))
+    return [*filter(None, lines)]
+
+
 def _road(instants: Sequence[Instant], T_base_lidar: Mapping[str, Array]) -> Road | None:
     """The road by the clouds of all LiDARs together; None if they show none."""
     joined = [
@@ -294,17 +308,19 @@ def _complete(frames: Sequence[Frame], rig: Rig) -> tuple[list[Frame], list[str]
 
 
 def judge_lidar(
-    poses: LidarPoses, name: str, tolerance: tuple[float, float], *, doubt: str = ""
-) -> Verdict:
+    poses: LidarPoses, name: str, tolerance: tuple[float, float], *, doubt: str = "",
+    twice: str = "",
+) -> Verdict:  # fmt: skip
     """The verdict of one LiDAR for a tolerance [deg, cm].
 
     What counts data is in the error bar, and no sign of an error. The doubt is about the start:
-    where another pose fits as well.
+    where another pose fits as well. Clouds may be corrected twice.
     """
     covariance, by_planes = poses.covariance[name], name in poses.matched
     checks = [
         *([threshold("lidar_matched").check(poses.matched[name])] if by_planes else []),
         threshold("lidar_instants").check(poses.places),
+        *([Check(TWICE, "WARN", twice)] if twice else []),
         *(_loose(covariance, poses.base) or _wide(covariance, tolerance)),
     ]
     if poses.places > 1:
