@@ -5,6 +5,7 @@
 writes them anew between the lines ``<!-- generated: NAME -->`` and ``<!-- end generated -->``.
 """
 
+import inspect
 import json
 import re
 from collections import Counter
@@ -177,9 +178,9 @@ def settings_list(model: type[BaseModel], leave_out: Iterable[str] = ()) -> str:
 
 def attributes_of(docstring: str) -> dict[str, str]:
     """What the section "Attributes" of a docstring has to each name."""
-    section = docstring.partition("Attributes:\n")[2]
+    section = inspect.cleandoc(docstring).partition("Attributes:\n")[2]
     found: dict[str, str] = {}
-    for names, text in re.findall(r"^ {8}([\w, ]+): (.*?)(?=^ {8}\S|\Z)", section, re.M | re.S):
+    for names, text in re.findall(r"^ {4}([\w, ]+): (.*?)(?=^ {4}\S|\Z)", section, re.M | re.S):
         for name in names.split(", "):
             found[name] = _one_line(text)
     return found

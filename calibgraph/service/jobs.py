@@ -86,7 +86,11 @@ class JobTable:
                 path, timeout=0, check_same_thread=False, isolation_level=None
             )
             self._connection.row_factory = sqlite3.Row
-            self._connection.executescript(_SCHEMA)
+            try:
+                self._connection.executescript(_SCHEMA)
+            except BaseException:
+                self.close()
+                raise
         except sqlite3.Error as error:
             if error.sqlite_errorcode == sqlite3.SQLITE_BUSY:
                 why = "is in use by another server; stop that one, or give another --data"

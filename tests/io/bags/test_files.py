@@ -7,6 +7,7 @@ import struct
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import closing
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -292,7 +293,7 @@ def ros1_bomb(kind: str, pack: Callable[[], bytes]) -> Callable[[Path], Path]:
 def db3_bomb(folder: Path) -> Path:
     """A folder whose messages are compressed, one of them a bomb."""
     bag = write_bag(folder, "sqlite3", sample_messages(Messages("sqlite3")), compression="MESSAGE")
-    with sqlite3.connect(next(bag.glob("*.db3"))) as database:
+    with closing(sqlite3.connect(next(bag.glob("*.db3")))) as database, database:
         database.execute("UPDATE messages SET data = ?", [zstd_bomb()])
     return bag
 
@@ -302,7 +303,7 @@ def computed(schema: str) -> Callable[[Path], Path]:
 
     def make(folder: Path) -> Path:
         path = folder / "bomb.db3"
-        with sqlite3.connect(path) as database:
+        with closing(sqlite3.connect(path)) as database, database:
             database.executescript(
                 "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, "
                 "serialization_format TEXT);"
