@@ -90,6 +90,7 @@ def calibrate(
     config, report = config or Config(), progress or no_progress
     data = dataset if isinstance(dataset, Dataset) else load_dataset(dataset, rig)
     rig = rig if rig and data is dataset else data.rig
+    data = data.at_instants() if config.instant_clouds else data
     limits: Any = {"terms": terms, "time_limit_s": time_limit_s, "progress": report}
     watch = Stopwatch()
     if not rig.other_lidars:

@@ -109,6 +109,7 @@ def match(
         )  # fmt: skip
     bag = bag_settings(config, topic, every_s=every_s, motion=motion)
     data = dataset_from(dataset, rig, frames, bag, interval_s=interval_s)
+    data = data.at_instants() if settings.instant_clouds else data
     limit_s = time_limit_of(matcher, time_limit_s)
     with progress_bar() as progress:
         if data.rig.require_cameras().other_lidars:  # as of calibrate

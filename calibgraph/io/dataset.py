@@ -76,6 +76,12 @@ class Dataset:
         """At most ``most`` of the frames, evenly spread over them."""
         return self.only(spread_out(self.frames, most))
 
+    def at_instants(self) -> Dataset:
+        """The dataset with clouds that count as taken at one instant each."""
+        both = (self.frames, self.recorded)
+        frames, recorded = (tuple(frame.at_instant() for frame in of) for of in both)
+        return replace(self, frames=frames, recorded=recorded)
+
     def select(self, frames: str) -> Dataset:
         """Keep some frames, by their position among the frames sorted by name, from 0.
 

@@ -102,7 +102,7 @@ _INSTANT_S = 0.003  # in which all points of a cloud count as taken at once
 _MOST_M_S = 100.0  # of a vehicle
 _MOTION = "motion"
 """The key of an entry's :class:`ScanMotion`, if its cloud is corrected."""
-_COLUMNS = "cloud_columns"
+_COLUMNS, _INSTANT = "cloud_columns", "instant"
 
 
 Derived = TypeVar("Derived")
@@ -135,6 +135,7 @@ class Frame:
             files state it.
         columns: names of those of a .bin cloud, if the rig states them.
         joined: (4, 4) T_base_lidar of other LiDARs, whose clouds are a part of this one's.
+        is_instant: the points of its clouds count as taken at the stamp, whatever their times.
         arrays: the cloud and images by their paths, which are names, if they are in memory.
         kept: gray images, the cloud and what derives of them, which may then not be written to.
 
@@ -155,6 +156,7 @@ class Frame:
     images_after_s: Mapping[str, float] = field(default_factory=dict, kw_only=True, compare=False)
     columns: tuple[str, ...] | None = field(default=None, kw_only=True)
     joined: Mapping[str, Array] = field(default_factory=dict, kw_only=True, compare=False)
+    is_instant: bool = field(default=False, kw_only=True)
     arrays: Mapping[Path, NDArray[Any]] = field(
         default_factory=dict, kw_only=True, compare=False, repr=False
     )
@@ -187,6 +189,15 @@ class Frame:
         """(4, 4) of the LiDAR in a frame fixed to the ground; None if no poses are given."""
         return None if self.motion is None else self.motion.T_world_lidar
 
+    def at_instant(self) -> Frame:
+        """The frame with clouds of an instant: moved as a whole, if the times of images are known.
+
+        They are not kept.
+        """
+        after_s = [self.image_after_s(name) for name in self.image_paths]
+        find = self.find_motion if after_s and None not in after_s else None
+        return replace(self, is_instant=True, find_motion=find, kept=None)
+
     def with_burnt_in(self, found: Mapping[str, BurntIn]) -> Frame:
         """The frame whose images are filled where something is burnt in; it is not kept."""
         return replace(self, burnt_in=found, kept=None)
@@ -198,14 +209,17 @@ class Frame:
     def _load_cloud(self) -> NDArray[np.float32]:
         path, motion = self.cloud_path, self.motion
         if path.suffix == MESSAGE_SUFFIX:
-            cloud, times_s = load_bag_cloud(path, timed=motion is not None)
+            timed = motion is not None and not self.is_instant
+            cloud, times_s = load_bag_cloud(path, timed=timed)
             if motion is not None:
                 taken_s = np.zeros(len(cloud)) if times_s is None else times_s
                 cloud[:, :3] = motion.correct(cloud[:, :3], taken_s)
             found = with_intensity(cloud)
         else:
             found = self.arrays[path] if path in self.arrays else load_cloud(path, self.columns)
-            if motion is not None and (sweep := self._sweep_of("")) is not None:
+            if motion is not None and self.is_instant:
+                found[:, :3] = motion.correct(found[:, :3], np.zeros(len(found)))
+            elif motion is not None and (sweep := self._sweep_of("")) is not None:
                 found[:, :3] = motion.correct(*sweep)
         return thin_cloud(self._join(found) if self.joined else found)
 
@@ -215,9 +229,11 @@ class Frame:
         None where the vehicle is known to move, and its points have no times.
         """
         motion = self.motion
-        cloud, times_s = self._load_returns(lidar, timed=motion is not None)
+        timed = motion is not None and not self.is_instant
+        cloud, times_s = self._load_returns(lidar, timed=timed)
         points = move_points(cloud[:, :3].astype(np.float64), self.joined[lidar])
         if motion is not None:
+            times_s = np.zeros(len(points)) if self.is_instant else times_s
             if times_s is None:
                 return None
             points = motion.correct(points, times_s)
@@ -265,7 +281,7 @@ class Frame:
         return np.concatenate(points), np.concatenate(times_s)
 
     def _sweep_of(self, lidar: str) -> tuple[Array, Array] | None:
-        if self.cloud_path in self.arrays:
+        if self.cloud_path in self.arrays or self.is_instant:
             return None
         with suppress(DatasetError):  # numbers that are no times of one scan
             points, times_s = self.load_recorded(lidar, timed=True)
@@ -355,6 +371,7 @@ class Frame:
             motion = ScanMotion(tuple(np.asarray(self.twist_per_s).tolist()), 0.0)
         if motion is not None:
             files[_MOTION] = {"twist_per_s": list(motion.twist_per_s), "to_s": motion.to_s}
+            files |= {_INSTANT: True} if self.is_instant and self.find_motion else {}
         return files
 
 
@@ -437,7 +454,7 @@ def frame_of_entry(entry: Mapping[str, Any]) -> Frame:
     if (motion := entry.get(_MOTION)) is None:
         return frame
     found = ScanMotion(tuple(motion["twist_per_s"]), motion["to_s"])
-    return replace(frame, find_motion=lambda: found)
+    return replace(frame, find_motion=lambda: found, is_instant=entry.get(_INSTANT, False))
 
 
 def hash_source(path: Path) -> str:

@@ -95,8 +95,8 @@ class Config(StrictNumbers):
             ``solve``: ``focal``, ``centre``, ``distortion``; ``lens`` is all three. Also
             ``offset``, how long after its cloud an image is taken, and ``readout`` of a rolling
             shutter; ``clock`` is both.
-        instant_clouds: the points of a cloud count as taken at one instant, although they have
-            times: clouds are corrected for the motion of the vehicle, or it stood.
+        instant_clouds: clouds count as taken at their stamp, although points have times: they are
+            corrected for the motion of the vehicle already, or it stood.
         seed: of everything random.
         tracking: of the recalibration while driving.
     """

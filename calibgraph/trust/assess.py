@@ -14,6 +14,7 @@ from calibgraph.matching.run import MatchingRun
 from calibgraph.model.verdict import ABOUT_THE_DATA, BRIGHTNESS, Check
 from calibgraph.trust import (
     agreement,
+    corrected,
     guess,
     image_evidence,
     lens_checks,
@@ -51,6 +52,7 @@ RUN_CHECKS: tuple[Callable[[MatchingRun], Found], ...] = (
     matcher_checks.compare_ends,           # does matching from a displaced start end here?
     matcher_checks.going_on_checks,        # did the rounds end elsewhere first?
     matcher_checks.time_limit_checks,      # was anything left out for lack of time?
+    corrected.corrected_checks,            # are clouds corrected for motion twice?
     image_evidence.image_checks,           # do the images agree with the result?
     lens_checks.image_offset_checks,       # would they agree better at another time?
 )  # fmt: skip

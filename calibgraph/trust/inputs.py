@@ -33,6 +33,7 @@ from calibgraph.model.plausibility import find_implausible
 from calibgraph.model.rig import Rig
 from calibgraph.model.verdict import Check
 from calibgraph.trust.conventions import likely_intended_guess
+from calibgraph.trust.corrected import corrected_clouds
 from calibgraph.trust.thresholds import threshold
 
 _log = logging.getLogger(__name__)
@@ -148,7 +149,7 @@ def check_inputs(data: Dataset, rig: Rig, *, at_guess: bool = True) -> tuple[str
             placed by co-visible features.
     """
     doubts = _check_at_guess(data, rig) if at_guess else find_implausible(rig)
-    doubts += motion_doubts(data)
+    doubts += filter(None, [*motion_doubts(data), corrected_clouds(data)])
     for text in doubts:
         _log.warning(text)
     known = data.frames[0].twist_per_s is not None

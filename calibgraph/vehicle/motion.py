@@ -84,7 +84,7 @@ class Drive:
     def instant(self, number: int, lidars: Sequence[str]) -> Instant:
         """The clouds of a frame, and how the base moved."""
         frame, twist = self.frames[number], self.twist(number)
-        moves = bool((np.abs(twist) > _STILL).any())
+        moves = not frame.is_instant and bool((np.abs(twist) > _STILL).any())
         returns = {name: frame.load_recorded(name, timed=moves) for name in lidars}
         return Instant(number, returns, twist if moves else None)
 

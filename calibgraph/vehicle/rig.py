@@ -20,10 +20,11 @@ from calibgraph.io.dataset import Dataset, spread_out
 from calibgraph.io.frame import Frame, seconds_between
 from calibgraph.matching.cloud_similarity import find_upright
 from calibgraph.model.config import Config
-from calibgraph.model.geometry import move_points, transform, twist_between
+from calibgraph.model.geometry import adjoints, invert, move_points, transform, twist_between
 from calibgraph.model.rig import Rig, Vehicle
 from calibgraph.model.verdict import ABOUT_THE_DATA, Check, Verdict
 from calibgraph.progress import Progress
+from calibgraph.trust.corrected import LOOKED_AT, TWICE, corrected_twice
 from calibgraph.trust.probability import TABLES, judge, probability_beyond
 from calibgraph.trust.thresholds import threshold
 from calibgraph.vehicle.frame import Road, find_road, find_vehicle
@@ -148,23 +149,22 @@ def calibrate_rig_lidars(
         parts += placed.values()
         seen = f"placed by cameras that see what it and {rig.lidar} see"
         warnings.append(f"{', '.join(placed)}: {seen}")
-    poses, lines = _with_clock_errors(
+    poses, late = _with_clock_errors(
         drive, instants, views[rig.lidar], join_poses(parts, [rig.lidar, *guess])
     )
-    warnings += lines
-    vehicle = None
-    if rig.vehicle is not None:
-        progress("finding the vehicle's frame", 0, 1)
-        travel = Travel() if path is None else direction_of_travel(read_poses(path)[0])
-        vehicle, unknown = find_vehicle(rig.vehicle, _road(instants, poses.T_base_lidar), travel)
-        warnings += unknown
+    progress("finding the vehicle's frame", 0, 1)
+    vehicle, unknown = _find_vehicle(rig.vehicle, instants, poses, path)
+    twice = _corrected_twice(instants, poses.T_base_lidar)
+    warnings += [*late, *unknown, *twice]
     for line in warnings:
         _log.warning(line)
     return LidarResult(
         vehicle,
         poses,
         {
-            name: judge_lidar(poses, name, config.tolerance, doubt=doubts.get(name, ""))
+            name: judge_lidar(
+                poses, name, config.tolerance, doubt=doubts.get(name, ""), twice="; ".join(twice)
+            )
             for name in rig.other_lidars
         },
         tuple(warnings),
@@ -252,7 +252,8 @@ def _with_clock_errors(
     That is so while the vehicle moves on steadily and is not known to move. As far as steps between
     frames differ, it shows in what places differ by. Steps are by planes of the base.
     """
-    if any(each.twist_per_s is not None for each in instants):
+    is_stated = drive.frames[0].is_instant  # that clouds are of their stamps
+    if is_stated or any(each.twist_per_s is not None for each in instants):
         return poses, []
     pairs = [
         (i.frame, view.planes)
@@ -346,6 +347,26 @@ def _turn_by_motion(
     return transform(Rotation.align_vectors(pairs[:, 0], pairs[:, 1])[0].as_matrix())
 
 
+def _corrected_twice(instants: Sequence[Instant], T_base_lidar: Mapping[str, Array]) -> list[str]:
+    """A line per LiDAR whose clouds were corrected for motion before."""
+    moving, lines = [of for of in instants if of.twist_per_s is not None], list[str]()
+    for name, T in T_base_lidar.items():
+        turn = adjoints(invert(T)[None])[0]
+        seen = spread_out(moving, LOOKED_AT)
+        lines.append(corrected_twice(((i.returns[name], turn @ i.twist_per_s) for i in seen), name))
+    return [*filter(None, lines)]
+
+
+def _find_vehicle(
+    known: Vehicle | None, instants: Sequence[Instant], poses: LidarPoses, path: Path | None
+) -> tuple[Vehicle | None, tuple[str, ...]]:
+    """The vehicle's frame by the road and by the poses of a file, and what they cannot tell."""
+    if known is None:
+        return None, ()
+    travel = Travel() if path is None else direction_of_travel(read_poses(path)[0])
+    return find_vehicle(known, _road(instants, poses.T_base_lidar), travel)
+
+
 def _road(instants: Sequence[Instant], T_base_lidar: Mapping[str, Array]) -> Road | None:
     """The road by the clouds of all LiDARs together; None if they show none."""
     joined = [
@@ -392,17 +413,19 @@ def _complete(frames: Sequence[Frame], rig: Rig) -> tuple[list[Frame], list[str]
 
 
 def judge_lidar(
-    poses: LidarPoses, name: str, tolerance: tuple[float, float], *, doubt: str = ""
-) -> Verdict:
+    poses: LidarPoses, name: str, tolerance: tuple[float, float], *, doubt: str = "",
+    twice: str = "",
+) -> Verdict:  # fmt: skip
     """The verdict of one LiDAR for a tolerance [deg, cm].
 
     What counts data is in the error bar, and no sign of an error. The doubt is about the start:
-    where another pose fits as well.
+    where another pose fits as well. Clouds may be corrected twice.
     """
     covariance, by_planes = poses.covariance[name], name in poses.matched
     checks = [
         *([threshold("lidar_matched").check(poses.matched[name])] if by_planes else []),
         threshold("lidar_instants").check(poses.places),
+        *([Check(TWICE, "WARN", twice)] if twice else []),
         *(_loose(covariance, poses.base) or _wide(covariance, tolerance)),
     ]
     if poses.places > 1:

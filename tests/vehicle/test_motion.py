@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 import calibgraph
 from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError, DatasetError, FileError
-from calibgraph.model.geometry import transform
+from calibgraph.model.geometry import invert, move_points, transform
+from factors import displace
 from tests.vehicle.scenes import ALL_AROUND_DEG, HEIGHT_M, MOUNTS, draw_place, scan
 
 START_NS, SLICES, SCAN_S = 1_700_000_000_000_000_000, 12, 0.1
@@ -35,6 +36,18 @@ def sweep(boxes: Array, lidar: str, speed_m_s: float, rng: np.random.Generator, 
         points = scan(boxes, T_road_lidar, rng, azimuths_deg=azimuths_deg)
         parts += [(*point, round(1e9 * seconds)) for point in points.tolist()]
     return np.array(parts, dtype=[("x", "f4"), ("y", "f4"), ("z", "f4"), ("t", "u4")])
+
+
+def by_azimuth(cloud: np.ndarray, lidar: str) -> tuple[Array, Array]:
+    """(n, 3) points, and the times [s] at which a LiDAR that turns evenly fires there."""
+    points = np.column_stack([cloud[axis] for axis in "xyz"]).astype(np.float64)
+    turned = np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi) + 0.5
+    return points, LATE_S[lidar] + SCAN_S * turned
+
+
+def twist_at(speed_m_s: float) -> Array:
+    """(6,) of the base at the stamp."""
+    return np.array([0.0, 0.0, 0.2 * (speed_m_s > 0), speed_m_s, 0.0, 0.0])
 
 
 def write_drive(folder: Path, speeds_m_s: list[float]) -> Path:
@@ -74,6 +87,26 @@ def test_instants_that_move_are_brought_to_one_time(tmp_path, caplog):
     # scans last 0.1 s and begin 0.03 s apart: 15 cm as recorded
     assert np.abs(off).max() < 0.01, off
     assert (np.abs(off) < 3 * result.sigmas("front")[1] / 100).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stated", [False, True])
+def test_clouds_corrected_before_are_named_and_are_right_where_that_is_stated(stated, tmp_path):
+    folder = write_drive(tmp_path, [5.0, 5.0, 5.0])
+    for path in folder.glob("lidars/*/*.npy"):
+        cloud, T = np.load(path), MOUNTS[path.parent.name]
+        points, times_s = by_azimuth(cloud, path.parent.name)
+        moved = move_points(displace(move_points(points, T), twist_at(5.0), times_s), invert(T))
+        for axis, values in zip("xyz", moved.T, strict=True):
+            cloud[axis] = values
+        cloud["t"] = 1e9 * times_s
+        np.save(path, cloud)
+    result = calibgraph.calibrate(folder, config=calibgraph.Config(instant_clouds=stated))
+    lines = [line for line in result.warnings if "corrected for motion before" in line]
+    assert [line.partition(":")[0] for line in lines] == ([] if stated else ["top", "front"])
+    assert result.verdict.status == ("PASS" if stated else "WARN")
+    off = result.T_base_lidar["front"][:3, 3] - MOUNTS["front"][:3, 3]
+    assert (np.abs(off).max() < 0.01) == stated, off  # else 15 cm, with a bar of 3 mm
 
 
 def test_instants_that_move_are_left_out_where_points_have_no_times(tmp_path, caplog):

@@ -216,6 +216,17 @@ def test_times_that_are_all_equal_are_named_if_motion_is_to_be_corrected(
         assert all("so that --motion moves it as a whole" in text for text in found)
 
 
+def test_clouds_of_an_instant_are_moved_as_a_whole(
+    bag: tuple[Path, list[np.ndarray]], tmp_path: Path
+) -> None:
+    equal = write_bag(tmp_path / "equal", "mcap", messages(timed=False)[0])
+    whole, stated = (load_dataset(path, bag=BagOptions(motion="tf")) for path in (equal, bag[0]))
+    frame = stated.at_instants().frames[1]
+    assert frame.load_sweep() is None
+    for each in (frame, frame_of_entry(frame.entry())):
+        np.testing.assert_array_equal(each.load_cloud(), whole.frames[1].load_cloud())
+
+
 @pytest.mark.parametrize(
     ("kind", "values"),
     [
