@@ -131,6 +131,8 @@ def test_clouds_of_a_drive_that_are_a_frame_late_are_no_pass(tmp_path: Path):
     assert abs(off) > 0.15, "the way of a frame"
     assert found.sigmas("left")[1][0] > 100.0 * step / 2.5 and found.verdict.status == "WARN"
     assert "moves by 20 cm from one cloud to the next" in found.warnings[0]
+    stated = calibgraph.calibrate(tmp_path, config=calibgraph.Config(instant_clouds=True))
+    assert stated.sigmas("left")[1][0] < 5.0 and not stated.warnings
 
 
 def test_the_report_has_a_table_of_lidars(result: Calibration):
