@@ -287,9 +287,14 @@ _DECIMAL_COMMA = re.compile(r"[-+]?[0-9]+,[0-9]+(e[-+]?[0-9]+)?")
 
 def describe(error: ValidationError) -> str:
     """First problem of a pydantic error, in one line; a misspelt key before a missing one."""
-    first = min(error.errors(), key=lambda problem: problem["type"] != "extra_forbidden")
+    problems = error.errors()
+    first = min(problems, key=lambda problem: problem["type"] != "extra_forbidden")
     where = ".".join(str(part) for part in first["loc"])
     if first["type"] == "extra_forbidden":
+        inverse = re.sub("T_([^_]+)_([^_]+)", r"T_\2_\1", str(first["loc"][-1]))
+        missing = [each["loc"] for each in problems if each["type"] == "missing"]
+        if (*first["loc"][:-1], inverse) in missing:
+            return f"unknown key {where!r}; give its inverse, {inverse}"
         return f"unknown key {where!r}; remove it or correct its spelling"
     if first["type"] == "missing":
         return f"key {where!r} is missing; add it"
