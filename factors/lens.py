@@ -246,11 +246,10 @@ def ray_spreads(lens: Lens, rays: Array) -> Array:
 
 def _right_inverse(jacobians: Array) -> Array:
     """(n, 3, 2) J^T (J J^T)^-1 of (n, 2, 3) J."""
-    gram = jacobians @ jacobians.transpose(0, 2, 1)
-    a, b, c = gram[:, 0, 0], gram[:, 0, 1], gram[:, 1, 1]
+    u, v = jacobians[:, 0], jacobians[:, 1]
+    a, b, c = (np.einsum("ni,ni->n", *of)[:, None] for of in ((u, u), (u, v), (v, v)))
     over = 1.0 / np.maximum(a * c - b * b, _SINGULAR * (a + c) ** 2)
-    inverse = np.stack([c, -b, -b, a], axis=-1).reshape(-1, 2, 2) * over[:, None, None]
-    return np.asarray(jacobians.transpose(0, 2, 1) @ inverse)
+    return np.stack([over * (c * u - b * v), over * (a * v - b * u)], axis=2)
 
 
 def _first_rays(lens: Lens, pixels: Array) -> Array:

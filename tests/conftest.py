@@ -246,9 +246,9 @@ def open3d() -> Any:
     )
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    """Chromium."""
+    """Chromium, which would take processor time until the end of the session."""
     with chromium() as browser:
         yield browser
 

@@ -212,6 +212,11 @@ def matched(data: Dataset, table: Correspondences, terms: Terms = "full") -> Mat
     return match_in_rounds(data, data.rig, table, Config(), terms=terms, progress=no_progress)
 
 
+@pytest.fixture(scope="module")
+def matched_right(data: Dataset, truth: Rig) -> MatchingRun:
+    return matched(data, table_of(truth))
+
+
 def pair_error(rig: Rig, truth: Rig) -> tuple[float, float]:
     T, true = ({n: each.T_camera_lidar[n] for n in PAIR} for each in (rig, truth))
     a, b = PAIR
@@ -240,7 +245,7 @@ def test_a_camera_whose_matches_are_displaced_comes_back_to_its_neighbour(
 
 @pytest.mark.slow
 def test_cameras_are_matched_through_the_lenses_that_were_estimated(
-    data: Dataset, truth: Rig
+    data: Dataset, truth: Rig, matched_right: MatchingRun
 ) -> None:
     """With a focal length 2 % too long, matches had agreed on a pair that is 7 cm off."""
     wrong = put_lens_error(truth, "focal", 0.02).cameras[PAIR[0]]
@@ -248,19 +253,18 @@ def test_cameras_are_matched_through_the_lenses_that_were_estimated(
     config = Config(estimate=("focal",))
     run = match_in_rounds(data, guess, table_of(truth), config, progress=no_progress)
     found = refine_with_camera_pairs(run).solution
-    right = refine_with_camera_pairs(matched(data, table_of(truth))).solution
+    right = refine_with_camera_pairs(matched_right).solution
     assert len(found.camera_matches) == pytest.approx(len(right.camera_matches), rel=0.05)
     assert pair_error(found.solved_rig, truth)[1] < 1.0
 
 
 def test_without_time_terms_or_files_the_run_stays_as_it_is(
-    data: Dataset, truth: Rig, tmp_path: Path
+    data: Dataset, truth: Rig, matched_right: MatchingRun, tmp_path: Path
 ) -> None:
-    table = table_of(truth)
-    run = matched(data, table)
+    run = matched_right
     late = replace(run, out_of_time=True)
     assert refine_with_camera_pairs(late) is late
-    stage1 = matched(data, table, "stage1")
+    stage1 = matched(data, table_of(truth), "stage1")
     assert refine_with_camera_pairs(stage1) is stage1
     gone = {name: tmp_path / "gone.png" for name in truth.cameras}
     read = calibgraph.load_dataset(SAMPLE, truth)  # as none of them is kept
@@ -271,13 +275,15 @@ def test_without_time_terms_or_files_the_run_stays_as_it_is(
 
 @pytest.mark.parametrize(("late_s", "shown"), [(0.0005, True), (0.01, False)])
 def test_images_that_a_vehicle_takes_apart_show_no_relative_pose(
-    data: Dataset, truth: Rig, late_s: float, shown: bool
+    data: Dataset, matched_right: MatchingRun, late_s: float, shown: bool
 ) -> None:
     """At 10 m/s: they are 5 mm or 10 cm apart."""
-    run, twist = matched(data, table_of(truth)), np.r_[0.0, 0.0, 0.0, 10.0, 0.0, 0.0]
+    twist = np.r_[0.0, 0.0, 0.0, 10.0, 0.0, 0.0]
     times_s = {PAIR[0]: 0.0, PAIR[1]: late_s}
     drive = [replace(frame, twist=twist, images_after_s=times_s) for frame in data.frames]
-    after = refine_with_camera_pairs(replace(run, dataset=replace(data, frames=tuple(drive))))
+    after = refine_with_camera_pairs(
+        replace(matched_right, dataset=replace(data, frames=tuple(drive)))
+    )
     assert after.solution.camera_matches.pairs() == ([PAIR] if shown else [])
 
 
@@ -334,26 +340,34 @@ def test_a_camera_that_a_second_start_loses_does_not_fail_the_others(
     assert lost == {"left"}
 
 
-def ended_at(data: Dataset, seen: Rig, z_score: float) -> MatchingRun:
+@pytest.fixture(scope="module")
+def matched_wrong(data: Dataset, truth: Rig) -> MatchingRun:
+    """One camera is three degrees off."""
+    off = perturb(truth, rotation_deg=3.0, translation_m=0.3, seed=1).T_camera_lidar
+    return matched(data, table_of(truth.moved_to({"left": off["left"]})))
+
+
+def ended_at(run: MatchingRun, z_score: float) -> MatchingRun:
     """A run with such a z-score of all cameras."""
-    run = matched(data, table_of(seen))
     run.matcher.tracking_rounds = (0,)
-    of_all = replace(run.correspondences.findings, z_score=dict.fromkeys(seen.cameras, z_score))
+    of_all = replace(
+        run.correspondences.findings, z_score=dict.fromkeys(run.guess.cameras, z_score)
+    )
     return replace(run, correspondences=run.correspondences.with_findings(of_all))
 
 
 @pytest.mark.parametrize(("z_score", "taken"), [(9.0, True), (2.0, False)])
 @pytest.mark.parametrize("beside", [True, False])
 def test_a_second_end_that_agrees_better_is_taken(
-    data: Dataset, truth: Rig, beside: bool, z_score: float, taken: bool
-) -> None:
-    """One camera is three degrees off: it is tried beside the others, whose relative pose is that
-    of the guess; from a displaced start; and again where that ends far away."""
-    off = perturb(truth, rotation_deg=3.0, translation_m=0.3, seed=1).T_camera_lidar
-    wrong = ended_at(data, truth.moved_to({"left": off["left"]}), 5.0)
+    truth: Rig, matched_right: MatchingRun, matched_wrong: MatchingRun,
+    beside: bool, z_score: float, taken: bool,
+) -> None:  # fmt: skip
+    """The camera that is off is tried beside the others, whose relative pose is that of the guess;
+    from a displaced start; and again where that ends far away."""
+    wrong = ended_at(matched_wrong, 5.0)
     if not beside:
         wrong = replace(wrong, guess=perturb(truth, rotation_deg=3.0, translation_m=0.3, seed=2))
-    with patch.object(rounds, "run_again", return_value=ended_at(data, truth, z_score)) as again:
+    with patch.object(rounds, "run_again", return_value=ended_at(matched_right, z_score)) as again:
         after = follow_neighbours(wrong) if beside else rounds.rematch(wrong)
     assert again.call_count == 1 + (taken and not beside)
     tried = again.call_args.args[1].T_camera_lidar
@@ -370,10 +384,10 @@ def test_a_second_end_that_agrees_better_is_taken(
         assert ({*ends} == {"PASS"}) == taken
 
 
-def test_cameras_that_scatter_alike_follow_none(data: Dataset, truth: Rig) -> None:
+def test_cameras_that_scatter_alike_follow_none(matched_right: MatchingRun, truth: Rig) -> None:
     """A guess that is off by itself in each camera tells no relative pose."""
     guess = perturb(truth, rotation_deg=3.0, translation_m=0.3, seed=1)
-    run = replace(ended_at(data, truth, 5.0), guess=guess)
+    run = replace(ended_at(matched_right, 5.0), guess=guess)
     with patch.object(rounds, "run_again", side_effect=AssertionError):
         assert follow_neighbours(run) is run
 

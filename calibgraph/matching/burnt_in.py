@@ -12,7 +12,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError
 from calibgraph.io.dataset import Dataset, spread_out
 from calibgraph.io.frame import Frame
@@ -107,10 +106,10 @@ def _common_share(one: Edges, other: Edges) -> float:
     """The share of the edges of the view with fewer that are in the other, too; of one in nine."""
     if one.shape != other.shape:
         return 0.0
-    a, b = (edges[::3, ::3].reshape(-1, 2) for edges in (one, other))
-    fewer = min(int(np.count_nonzero(edges.any(axis=1))) for edges in (a, b))
-    common = int(np.count_nonzero((a * b).sum(axis=1) > _PARALLEL))
-    return common / max(1, fewer)
+    (ax, ay), (bx, by) = (np.moveaxis(edges[::3, ::3], 2, 0) for edges in (one, other))
+    fewer = min(int(np.count_nonzero((x != 0) | (y != 0))) for x, y in ((ax, ay), (bx, by)))
+    common = np.count_nonzero(ax * bx + ay * by > _PARALLEL)
+    return float(common / max(1, fewer))
 
 
 def _with_others(name: str, views: Mapping[str, Sequence[Edges]], rig: Rig) -> list[Edges]:
@@ -128,11 +127,10 @@ def _still(views: Sequence[Edges], rig: Rig, name: str) -> BurntIn | None:
     if len(views) < _LEAST_VIEWS:
         return None
     mean = np.mean(views, axis=0)
-    edges = np.mean([np.any(view, axis=2) for view in views], axis=0)
     least = _PARALLEL * (1 - len(views) // _MISSED / len(views))
     camera = rig.cameras[name]
     mask, rectangles = np.zeros(mean.shape[:2], np.uint8), []
-    for part, rectangle in _things(mean, edges, least):
+    for part, rectangle in _things(views, mean, least):
         mask |= part
         rectangles.append(rectangle)
     if not rectangles:
@@ -147,16 +145,16 @@ def _still(views: Sequence[Edges], rig: Rig, name: str) -> BurntIn | None:
 
 
 def _things(
-    mean: Edges, share: Array, least: float
+    views: Sequence[Edges], mean: Edges, least: float
 ) -> Iterator[tuple[NDArray[np.uint8], Rectangle]]:
     """The pixels of each thing with a margin, and its rectangle.
 
     Args:
-        mean: of the views.
-        share: (height, width) of the views that have an edge there.
+        views: of the camera.
+        mean: of them.
         least: length of it where an edge stands still.
     """
-    length = np.linalg.norm(mean, axis=2)
+    length = np.hypot(mean[..., 0], mean[..., 1])
     near = cv2.getStructuringElement(cv2.MORPH_RECT, (_GAP_PX, _GAP_PX))
     joined = cv2.dilate((length >= least).astype(np.uint8), near)
     _, labels, stats, _ = cv2.connectedComponentsWithStats(joined)
@@ -164,8 +162,11 @@ def _things(
         inside = np.s_[top : top + height, left : left + width]
         still = (labels[inside] == number) & (length[inside] >= least)
         edges = mean[inside][still]
-        all_edges = share[inside][labels[inside] == number].sum()
-        if len(edges) < max(_LEAST_PX, _LEAST_STILL * all_edges):
+        if len(edges) < _LEAST_PX:
+            continue
+        own = labels[inside] == number
+        all_edges = np.mean([np.count_nonzero(view[inside][own].any(axis=1)) for view in views])
+        if len(edges) < _LEAST_STILL * all_edges:
             continue
         if np.mean(length[inside][still] > _EXACTLY) < _LEAST_EXACT:
             continue

@@ -111,12 +111,14 @@ def _are_same(pairs: Sequence[tuple[_View, _View]]) -> bool:
 
 def _fit(one: _View, two: _View) -> Array | None:
     """(2, 3) the map from the second image to the first, if it is a copy of it."""
-    matcher = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True)
-    found = matcher.match(one.descriptors, two.descriptors)
-    if len(found) < _LEAST_MATCHES:
+    # the bits that differ, of nearest to each other: half the time of OpenCV's matcher
+    words = zip(one.descriptors.view(np.uint64).T, two.descriptors.view(np.uint64).T, strict=True)
+    apart = sum(np.bitwise_count(a[:, None] ^ b).astype(np.uint16) for a, b in words)
+    nearest = np.argmin(apart, axis=1)
+    mutual = np.flatnonzero(np.argmin(apart, axis=0)[nearest] == np.arange(len(nearest)))
+    if len(mutual) < _LEAST_MATCHES:
         return None
-    a = one.points[[match.queryIdx for match in found]]
-    b = two.points[[match.trainIdx for match in found]]
+    a, b = one.points[mutual], two.points[nearest[mutual]]
     M, inlier = cv2.estimateAffine2D(b, a, ransacReprojThreshold=_NEAR_PX)
     if M is None or np.count_nonzero(inlier) < _LEAST_MATCHES:
         return None

@@ -78,10 +78,13 @@ def build_world(mesh: Mesh, sun: Array, rng: np.random.Generator) -> World:
     scene.add_triangles(open3d.core.Tensor(corners.reshape(-1, 3)), open3d.core.Tensor(order))
     uv = mesh["uv_m"]
     table = [_normals(mesh["corners_m"]), uv[:, 0], uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]]
-    paints, paint = np.unique(mesh["paint"], axis=0, return_inverse=True)
+    changes = np.ones(len(mesh), np.bool_)  # a solid is of one paint: sorting all rows takes longer
+    changes[1:] = (mesh["paint"][1:] != mesh["paint"][:-1]).any(axis=1)
+    paints, paint = np.unique(mesh["paint"][changes], axis=0, return_inverse=True)
+    paint = paint.ravel()[np.cumsum(changes) - 1]
     return World(
         scene=scene,
-        surfaces=np.column_stack([*table, mesh["albedo"], paint.ravel()]).astype(np.float32),
+        surfaces=np.column_stack([*table, mesh["albedo"], paint]).astype(np.float32),
         paints=paints,
         grain=_noise_texture(rng),
         sun=sun,

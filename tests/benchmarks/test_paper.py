@@ -1,7 +1,6 @@
 """The paper's experiment and its solver: rows, intervals, seeds, failures, its report."""
 
 import sys
-from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -9,7 +8,7 @@ import pytest
 from benchmarks.paper.__main__ import main
 from benchmarks.paper.baselines import TRF_TOLERANCE
 from benchmarks.paper.draws import HEADLINE, METHODS, TRF_TERMS, source_from
-from benchmarks.paper.experiment import interval, run_experiment
+from benchmarks.paper.experiment import interval
 from benchmarks.paper.output import PAIR, published
 from calibgraph import preset
 from calibgraph.model.geometry import to_T_lidar_camera
@@ -29,21 +28,6 @@ def test_every_row_and_metric_is_printed(
     rows = [line.split(" | ")[0].strip("|* ") for line in tables.splitlines()]
     assert all(rows.count(name) == 3 for name in METHODS)  # two cameras, and between them
     assert "nan" not in tables and "| failed |" not in tables.replace("| failed | s |", "")
-
-
-def numbers_of(*, seed: int = 0) -> dict[str, object]:
-    """An experiment without the seconds that it took."""
-    report = run_experiment(
-        source_from("kitti"), frames=[1], draws=2, config=KITTI, seed=seed, jobs=1, trf=False
-    )
-    return {name: asdict(replace(row, seconds=0.0)) for name, row in report[1].items()}
-
-
-def test_the_same_seed_gives_the_same_numbers() -> None:
-    found = numbers_of()
-    assert found == numbers_of()
-    assert found != numbers_of(seed=1)
-    assert all(len(row["numbers"]["image_2"]) == 9 for row in found.values())  # type: ignore[index]
 
 
 def test_intervals_are_medians_and_quantiles() -> None:

@@ -8,13 +8,13 @@ import gtsam
 import numpy as np
 import pytest
 
-from factors import Clock, Columns, Lens, ProjectionBlock, displace, placed_factor, to_runs
+from factors import Clock, Columns, ProjectionBlock, displace, placed_factor, to_runs
 from factors.columns import COEFFICIENT_NUMBERS, DISTORTION
 from tests.draws.places import distortions_at
-from tests.factors.blocks import KEY, LENSES, TRUTH, K, at, poses, world
+from tests.factors.blocks import KEY, LENSES, TRUTH, at, poses, world
 from tests.factors.test_block import EACH_LENS_AND_SCALE, together
 
-KEY_CLOUD, KEY_LENS, FIRST_POINT = 6, 8, 100
+KEY_CLOUD, KEY_LENS = 6, 8
 SIGMAS = {"focal": 0.002, "aspect": 0.001, "centre_x": 2.0, "centre_y": 3.0}
 TWIST = np.array([0.05, -0.03, 0.4, 9.0, 0.3, -0.1])
 HEIGHT_PX = 480
@@ -80,61 +80,6 @@ def test_with_the_lens_held_it_is_the_block_factor(name: str) -> None:
         found = graph.linearize(values).hessian()
         np.testing.assert_allclose(found[0][6:12, 6:12], hessian, atol=1e-9 * np.abs(hessian).max())
         np.testing.assert_allclose(found[1][6:12], gradient, atol=1e-9 * np.abs(gradient).max())
-
-
-@pytest.mark.parametrize(
-    ("stock", "calibration", "distortion", "parameters"),
-    [
-        (gtsam.GeneralSFMFactor2Cal3_S2, gtsam.Cal3_S2, (), ()),
-        (
-            gtsam.GeneralSFMFactor2Cal3DS2,
-            gtsam.Cal3DS2,
-            (-0.2, 0.05, 0.001, -0.002),
-            ("k1", "k2", "p1", "p2"),
-        ),
-    ],
-)
-def test_equals_factors_of_gtsam(stock, calibration, distortion, parameters) -> None:  # type: ignore[no-untyped-def]
-    """Their calibration is fx, fy, skew, cx, cy and the coefficients; ours scales fx and fy."""
-    lens = Lens.of("pinhole", **K, distortion=distortion)
-    names = ("focal", "aspect", "centre_x", "centre_y", *parameters)
-    free_lens = Columns(lens, names, (1.0,) * len(names))
-    block = replace(world(lens, 20), sqrt_information=None, scale=np.inf)
-    pose = TRUTH.retract(np.full(6, 0.01))
-    theirs = at(pose)
-    theirs.insert(KEY_LENS, calibration(K["fx"], K["fy"], 0.0, K["cx"], K["cy"], *distortion))
-    factors = [
-        stock(pixel, gtsam.noiseModel.Unit.Create(2), KEY, number, KEY_LENS)
-        for number, pixel in enumerate(block.pixels_px, start=FIRST_POINT)
-    ]
-    chain = np.zeros((6 + 5 + len(parameters), 6 + len(names)))
-    chain[:6, :6] = np.eye(6)
-    chain[6, 6:8], chain[7, 6:8] = [K["fx"], K["fx"] / 2], [K["fy"], -K["fy"] / 2]
-    chain[9:, 8:] = np.eye(2 + len(parameters))
-    ours = with_lens(pose, np.zeros(len(names)))
-    one, many = gtsam.NonlinearFactorGraph(), gtsam.NonlinearFactorGraph()
-    one.add(placed_factor([KEY_CLOUD, KEY, KEY_LENS], block, free_lens))
-    for number, (factor, point) in enumerate(
-        zip(factors, block.points_lidar_m, strict=True), start=FIRST_POINT
-    ):
-        many.add(factor)
-        theirs.insert(number, point)
-    points, size = range(FIRST_POINT, FIRST_POINT + len(factors)), len(chain)
-    whole = to_ordering([KEY, KEY_LENS, *points])
-    hessian, gradient = (part[:size, ...] for part in many.linearize(theirs).hessian(whole))
-    order = to_ordering([KEY_CLOUD, KEY, KEY_LENS])
-    found = [part[6:, ...] for part in one.linearize(ours).hessian(order)]
-    np.testing.assert_allclose(2 * one.error(ours), 2 * many.error(theirs), rtol=1e-9)
-    expected, pulled = chain.T @ hessian[:, :size] @ chain, chain.T @ gradient
-    np.testing.assert_allclose(found[0][:, 6:], expected, atol=1e-9 * np.abs(expected).max())
-    np.testing.assert_allclose(found[1], pulled, atol=1e-9 * np.abs(pulled).max())
-
-
-def to_ordering(keys: list[int]) -> gtsam.Ordering:
-    order = gtsam.Ordering()
-    for key in keys:
-        order.push_back(key)
-    return order
 
 
 def test_a_displaced_cloud_is_a_displaced_camera() -> None:

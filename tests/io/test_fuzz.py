@@ -204,13 +204,18 @@ def main(kind: str, seed: int, count: int, folder: Path) -> None:
     print(read, count - read, grown // 1024)
 
 
+OFTEN = (pytest.mark.slow, pytest.mark.ci)
+
+
 @pytest.mark.parametrize(
     ("kind", "count", "most_mb"),
     [
-        ("clouds", 300, 300),  # that numpy takes for a moment; a header may claim exabytes
+        pytest.param(
+            "clouds", 300, 300, marks=OFTEN
+        ),  # that numpy takes for a moment; a header may claim exabytes
         pytest.param("clouds", 10_000, 300, marks=pytest.mark.slow),
         pytest.param("tables", 300, 300, marks=pytest.mark.slow),
-        ("bags", 60, 200),
+        pytest.param("bags", 60, 200, marks=OFTEN),
         pytest.param("bags", 2000, 200, marks=pytest.mark.slow),
     ],
 )

@@ -49,3 +49,10 @@ def test_a_ball_is_where_the_lens_projects_it(lens: str, place_m: tuple[float, .
     # covered by quarters: 0.02 px. Half a pixel's shift of the grid shows.
     assert np.count_nonzero(covered) > 5
     assert np.allclose([u, v], expected, atol=0.12)
+
+
+def test_triangles_have_their_own_paints() -> None:
+    mesh = mesh_of_solid(ellipsoid((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (0.0, 0.0, 0.0, 0.0)))
+    mesh["paint"] = np.repeat([3.0, 1.0, 1.0, 2.0], -(-len(mesh) // 4))[: len(mesh), None]
+    world = build_world(mesh, np.array([0.0, 0.0, 1.0]), np.random.default_rng(0))
+    np.testing.assert_array_equal(world.paints[world.surfaces[:, -1].astype(int)], mesh["paint"])

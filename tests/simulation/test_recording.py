@@ -22,7 +22,8 @@ pytestmark = pytest.mark.usefixtures("open3d")
 @pytest.mark.parametrize(
     ("surroundings", "vary_layout"),
     [
-        ("street", False), ("street", True),
+        ("street", True),
+        pytest.param("street", False, marks=pytest.mark.slow),
         *(pytest.param(name, True, marks=pytest.mark.slow) for name in [*SURROUNDINGS][1:]),
     ],
 )  # fmt: skip

@@ -219,6 +219,8 @@ while True:
 """
 
 
+@pytest.mark.ci
+@pytest.mark.slow
 def test_every_input_acknowledged_before_a_sigkill_is_there(tmp_path: Path) -> None:
     rng, acknowledged = np.random.default_rng(5), 0
     for _ in range(int(os.environ.get("CALIBGRAPH_TEST_KILLS", "2"))):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import gtsam
@@ -291,20 +292,16 @@ def test_a_camera_that_sees_a_place_later_than_another_is_taken_in() -> None:
 # Where the place of a frame comes from
 
 
-@pytest.mark.parametrize("cut", [41, 63, 69, 70])
-def test_places_are_there_after_a_restart(tmp_path: Path, cut: int) -> None:
+def test_places_are_there_after_a_restart(tmp_path: Path) -> None:
     """With summaries of places, within the steps that an epoch's end leaves, and between them."""
     tables = [states(table) for table in drive(pair_of(), 82)]
-    folder, config = tmp_path / "state", Config().changed(tracking={"live_epochs": 1})
+    config, cuts = Config().changed(tracking={"live_epochs": 1}), (0, 41, 63, 69, 70, len(tables))
     whole = IncrementalCalibrator(pair_of(), config)
-    with DurableCalibrator(folder, pair_of(), config) as calibrator:
-        for frame, table in enumerate(tables[:cut]):
-            calibrator.update(table, place=frame // 4 % 3)
-    with DurableCalibrator(folder, pair_of(), config) as calibrator:
-        for frame, table in enumerate(tables):
-            expected = whole.update(table, place=frame // 4 % 3)
-            if frame >= cut:
-                found = calibrator.update(table, place=frame // 4 % 3)
+    for start, end in pairwise(cuts):
+        with DurableCalibrator(tmp_path / "state", pair_of(), config) as calibrator:
+            for frame in range(start, end):
+                found = calibrator.update(tables[frame], place=frame // 4 % 3)
+                expected = whole.update(tables[frame], place=frame // 4 % 3)
     for name, T in expected.T_camera_lidar.items():
         np.testing.assert_array_equal(found.T_camera_lidar[name], T)
         np.testing.assert_array_equal(found.covariance[name], expected.covariance[name])

@@ -9,7 +9,6 @@ import pytest
 from calibgraph import Config, Correspondences, MatcherErrors, Rig, simulate_correspondences
 from calibgraph.solver.matches import CameraBlock, camera_blocks
 from calibgraph.solver.preprocess import preprocess
-from calibgraph.tracking.estimate import Terms
 from calibgraph.tracking.state import STRENGTHS
 from calibgraph.tracking.sums import MOST_PLACES, PlaceSums, Sums
 
@@ -100,67 +99,6 @@ def test_the_walk_adds_exactly_its_variance_to_the_covariance() -> None:
 def inverse_sandwich(sums: Sums) -> Array:
     inverse = np.linalg.inv(sums.hessian)
     return np.asarray(inverse @ sums.scatter @ inverse)
-
-
-def test_places_are_eliminated_as_by_one_system_of_all_poses() -> None:
-    """Three cameras at four places, one of which a camera has not seen: by dense algebra."""
-    rng, P, n = np.random.default_rng(0), 4, 3
-
-    def definite(*shape: int) -> Array:
-        root = rng.standard_normal((*shape, 6, 6))
-        return root @ root.swapaxes(-1, -2) + 0.1 * np.eye(6)
-
-    known, at_place, cloud, shared = definite(P, n), definite(P, n), definite(P), definite(n)
-    minimum, adjoint = rng.standard_normal((P, n, 6)), rng.standard_normal((n, 6, 6))
-    seen = np.ones((P, n), dtype=np.bool_)
-    seen[1, 2] = False
-    terms = Terms(
-        names=tuple("abcd"),
-        known=np.full(P, -1),
-        seen=seen,
-        information=known * seen[..., None, None],
-        minimum=minimum,
-        at_place=at_place,
-        cloud=cloud,
-        robust_scale=np.inf,
-    )
-    chain = np.hstack([-adjoint.reshape(-1, 6), np.eye(6 * n)])
-    found = terms.eliminate(np.ones((P, 1 + n)), chain)
-    size = 6 * (n + P + P * n)
-    hessian, vector = np.zeros((size, size)), np.zeros(size)
-
-    def add(parts: dict[int, Array], information: Array, value: Array) -> None:
-        jacobian = np.zeros((6, size))
-        for index, block in parts.items():
-            jacobian[:, 6 * index : 6 * index + 6] = block
-        hessian[...] += jacobian.T @ information @ jacobian
-        vector[...] += jacobian.T @ information @ value
-
-    for p in range(P):
-        add({n + p: np.eye(6)}, np.linalg.inv(cloud[p]), np.zeros(6))
-        for c in range(n):
-            v = n + P + p * n + c
-            add({v: np.eye(6)}, np.linalg.inv(at_place[p, c]), np.zeros(6))
-            if seen[p, c]:
-                parts = {c: np.eye(6), n + p: -adjoint[c], v: np.eye(6)}
-                add(parts, known[p, c], minimum[p, c])
-    k = 6 * n
-    gain = hessian[:k, k:] @ np.linalg.inv(hessian[k:, k:])
-    shown = hessian[:k, :k] - gain @ hessian[k:, :k]
-    np.testing.assert_allclose(found.hessian, chain.T @ shown @ chain, atol=1e-11)
-    pull = vector[:k] - gain @ vector[k:]
-    np.testing.assert_allclose(found.gradient, -chain.T @ pull, atol=1e-11)
-    for camera in range(n):  # with what all places share, the poses of places
-        rows = slice(6 * camera, 6 * camera + 6)
-        hessian[rows, rows] += shared[camera]
-    optimum, covariance = np.linalg.solve(hessian, vector), np.linalg.inv(hessian)
-    u, v = found.displacements(optimum[:k].reshape(n, 6))
-    np.testing.assert_allclose(np.concatenate([u.ravel(), v.ravel()]), optimum[k:])
-    open_u, open_v = found.open_freedom(covariance[:k, :k])
-    blocks = [np.linalg.inv(own) for own in (*cloud, *at_place.reshape(-1, 6, 6))]
-    for index, expected in enumerate([*open_u, *open_v.ravel()]):
-        rows = slice(k + 6 * index, k + 6 * index + 6)
-        np.testing.assert_allclose(np.trace(blocks[index] @ covariance[rows, rows]), expected)
 
 
 ERRORS = MatcherErrors(noise_px=1.0, frame_noise_px=0.5, outlier_share=0.1)

@@ -126,15 +126,15 @@ def test_a_swap_is_named_as_far_as_the_guesses_can_show_it(
     right = pair.T_camera_lidar
     swapped = dict(zip(right, reversed(right.values()), strict=True))
     statuses: dict[bool, list[str]] = {True: [], False: []}
-    for seed in range(300):
+    for seed in range(100):
         drawn = calibgraph.perturb(
             pair, rotation_deg=degrees, translation_m=metres, seed=seed, uniform=True
         )
         for is_swapped, results in ((False, right), (True, swapped)):
             check = dict(compare_with_other_guesses(drawn.T_camera_lidar, results))["left"]
             statuses[is_swapped].append(check.status)
-    assert statuses[False].count("FAIL") <= false_fails * 300
-    assert statuses[True].count("FAIL") >= named * 300
+    assert statuses[False].count("FAIL") <= false_fails * 100
+    assert statuses[True].count("FAIL") >= named * 100
 
 
 def test_points_in_millimetres_fail(pair: Rig) -> None:
@@ -211,11 +211,13 @@ def test_mirrored_images_are_named(tmp_path: Path) -> None:
     shutil.copytree(SAMPLE, copy)
     for path in (copy / "cameras" / "left").iterdir():
         cv2.imwrite(str(path), cv2.flip(cv2.imread(str(path)), 1))
-    found = likely_intended_guess(calibgraph.load_dataset(copy, frames="0:3"), rough_guess(5))
+    found = likely_intended_guess(calibgraph.load_dataset(copy, frames="0"), rough_guess(5))
     assert found is not None and found.startswith("the images of left are mirrored")
 
 
-@pytest.mark.parametrize(("rotation_deg", "translation_m"), [(4.0, 0.3), (20.0, 1.5)])
+@pytest.mark.parametrize(
+    ("rotation_deg", "translation_m"), [pytest.param(4.0, 0.3, marks=SLOW), (20.0, 1.5)]
+)
 def test_no_mistake_is_seen_in_a_guess_that_is_only_rough(
     rotation_deg: float, translation_m: float
 ) -> None:

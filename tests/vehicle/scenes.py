@@ -26,6 +26,14 @@ MOUNTS = {
 ALL_AROUND_DEG = np.arange(-180.0, 180.0, 1.0)
 
 
+def displaced(T: Array, seed: int, deg: float, metres: float) -> Array:
+    """A pose turned and shifted by so much, in random directions."""
+    turn, shift = np.random.default_rng(seed).normal(size=(2, 3))
+    turn, shift = (each / np.linalg.norm(each) for each in (turn, shift))
+    R = Rotation.from_rotvec(np.radians(deg) * turn).as_matrix()
+    return transform(R @ T[:3, :3], T[:3, 3] + metres * shift)
+
+
 def draw_place(
     rng: np.random.Generator, *, boxes: int = 14, fronts: bool = True, ahead_m: float = 0.0
 ) -> Array:

@@ -21,7 +21,7 @@ from calibgraph.model.geometry import transform
 from calibgraph.report.html import render_page
 from calibgraph.report.tables import print_result
 from tests.conftest import SAMPLE, Call, require_poses
-from tests.vehicle.scenes import MOUNTS, record
+from tests.vehicle.scenes import MOUNTS, displaced, record
 
 RIG = {"format": "calibgraph-rig/1", "lidar": "top", "lidars": {name: {} for name in MOUNTS}}
 
@@ -49,7 +49,11 @@ def vehicle(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "T_vehicle_lidar": transform(np.eye(3), [1.0, 0.0, 1.7]).tolist(),
         "rotation_sigma_rad": 0.02, "translation_sigma_m": [0.01, 0.01, 0.3],
     }  # fmt: skip
-    return write_vehicle(tmp_path_factory.mktemp("vehicle"), vehicle=known)
+    guesses = {
+        name: {} if name == "top" else {"T_base_lidar": displaced(T, 1, 5.0, 0.1).tolist()}
+        for name, T in MOUNTS.items()
+    }
+    return write_vehicle(tmp_path_factory.mktemp("vehicle"), vehicle=known, lidars=guesses)
 
 
 @pytest.fixture(scope="module")
