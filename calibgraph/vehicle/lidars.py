@@ -49,6 +49,7 @@ errors have squares of 0.6 to 1.3 of the variance; with 3 it is 0.4 to 1.6."""
 GUESS_SIGMAS = np.repeat([np.radians(10.0), 1.0], 3)
 """(6,) [rad, m] of a direction that no plane determines."""
 _EXACT = 1e-18  # [m^2, rad^2] least variance, for rounding
+_LEAST_VARIANCE = 1e-9  # [m^2] of residuals: without, exact scans determine more than numbers hold
 _SETTLED, _MOST_STEPS = 0.01, 50  # of REML
 
 
@@ -296,7 +297,7 @@ def _at_place(
     hessian, cells = basis.T @ whole, basis.T @ sums.hessian @ basis
     gradients = (sums.gradient @ basis)[:, :, None]
     apart = np.linalg.solve(hessian - cells, gradients)[:, :, 0]  # of a fit without the cell
-    root = np.linalg.cholesky(_shrunk(apart, hessian) + _EXACT * np.eye(len(hessian)))
+    root = np.linalg.cholesky(_shrunk(apart, hessian) + _LEAST_VARIANCE * np.eye(len(hessian)))
     seen = np.linalg.solve(hessian, whole.T)
     by = scipy.linalg.solve_triangular(root, seen, lower=True)  # (q, d)
     return by.T @ by, by.T @ by @ _steps_between(T_base_lidar, T)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -13,12 +14,13 @@ from scipy.spatial.transform import Rotation
 
 from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError, DatasetError
+from calibgraph.io.bag_frames import scans_beside
 from calibgraph.io.clouds import TIMES
 from calibgraph.io.dataset import Dataset, spread_out
-from calibgraph.io.frame import Frame
+from calibgraph.io.frame import Frame, seconds_between
 from calibgraph.matching.cloud_similarity import find_upright
 from calibgraph.model.config import Config
-from calibgraph.model.geometry import move_points, transform
+from calibgraph.model.geometry import move_points, transform, twist_between
 from calibgraph.model.rig import Rig, Vehicle
 from calibgraph.model.verdict import ABOUT_THE_DATA, Check, Verdict
 from calibgraph.progress import Progress
@@ -30,11 +32,14 @@ from calibgraph.vehicle.lidars import (
     PLACE_SIGMAS,
     LidarPoses,
     calibrate_lidars,
+    count_matched,
     join_poses,
+    refine_poses,
 )
 from calibgraph.vehicle.motion import REACH_M, Drive, Instant
-from calibgraph.vehicle.planes import View, Views, look
-from calibgraph.vehicle.start import locate_lidars
+from calibgraph.vehicle.planes import Planes, View, Views, find_planes, look, thinned
+from calibgraph.vehicle.start import distance_between, is_near, locate_lidars
+from calibgraph.vehicle.sums import step_twists
 from calibgraph.vehicle.travel import POSE_FILES, Travel, direction_of_travel, read_poses
 
 MOST_INSTANTS = 20
@@ -48,6 +53,12 @@ _HOW_TO_JOIN = (
     "or drive 150 m past walls, with times of points, and stamps in the names of clouds or in "
     "times.txt, so that LiDARs are joined by motion"
 )
+_CLOCK_FRAMES = 0.5
+"""Standard deviation of the times of an instant's clouds, in steps between frames, where they are
+not known: of clouds paired by stamps up to 0.5, of one that is a frame late 1."""
+_CLOCK_M = 0.01  # from which a line states it
+_PAIRS, _STEP_PLANES, _STEP_SHARE = 5, 1500, 0.9  # of neighbouring frames; of planes that must fit
+_MOST_HALF_M = 500.0  # within which half of the points are
 _ROUNDS = 2  # while it moves: clouds are brought to one time by the poses found
 _LOOSE = 0.3  # sigma of an axis over that of the guess: planes hardly determine it
 _OPEN = 0.98  # probability of an error by a bar alone: what is open is not known to be wrong
@@ -113,17 +124,17 @@ def calibrate_rig_lidars(
     if lost:
         progress("joining LiDARs by motion", 0, 1)
         far = {name: T for name, T in guess.items() if name not in start}
-        known = {name: T for name, T in far.items() if T is not None}
         try:
             poses, more, line = _join_by_motion(drive, instants, far, lost, base=rig.lidar)
             parts, doubts = [poses], doubts | more
         except CalibrationError:
-            if len(known) < len(far):
+            if any(T is None for T in far.values()):
                 raise
-            placed, reasons = _placed(known, place)
-            missing = {name: T for name, T in known.items() if name not in placed}
-            start, line = start | missing, f"{lost}; begun from the guess" if missing else lost
-        warnings.append(line)
+            placed, reasons = _placed(far, place)
+            missing = {name: T for name, T in far.items() if T is not None and name not in placed}
+            begun, more, line = _begin(views, guess, missing, lost, base=rig.lidar)
+            start, doubts = start | begun, doubts | more
+        warnings += filter(None, [line])
     progress("calibrating LiDARs", 0, 1)
     if start:
         try:
@@ -137,7 +148,10 @@ def calibrate_rig_lidars(
         parts += placed.values()
         seen = f"placed by cameras that see what it and {rig.lidar} see"
         warnings.append(f"{', '.join(placed)}: {seen}")
-    poses = join_poses(parts, [rig.lidar, *guess])
+    poses, lines = _with_clock_errors(
+        drive, instants, views[rig.lidar], join_poses(parts, [rig.lidar, *guess])
+    )
+    warnings += lines
     vehicle = None
     if rig.vehicle is not None:
         progress("finding the vehicle's frame", 0, 1)
@@ -172,9 +186,46 @@ def _placed(
     return found, reasons
 
 
+def _begin(
+    views: Views, guess: Mapping[str, Array | None], missing: Mapping[str, Array], lost: str, *,
+    base: str,
+) -> tuple[dict[str, Array], dict[str, str], str]:  # fmt: skip
+    """The poses (4, 4) at which LiDARs are begun that do not fit their guess, doubts, and a line.
+
+    That is where they fit without a guess, else the guess.
+    """
+    found, doubts = dict[str, Array](), dict[str, str]()
+    if missing:
+        with suppress(CalibrationError):  # no ground
+            found, doubts, _ = locate_lidars(views, {**guess, **dict.fromkeys(missing)}, base=base)
+    for name in missing.keys() & found.keys():
+        degrees, metres = distance_between(found[name], missing[name])
+        others = [n for n, T in guess.items() if T is not None and is_near(found[name], T)]
+        why = f"are its clouds those of {others[0]}?" if others else (
+            "is that p_base = T_base_lidar * p_lidar, in metres, and are the clouds its own?"
+        )  # fmt: skip
+        doubts[name] = (
+            f"it does not fit its guess, but turned by {degrees:.0f} deg and moved by "
+            f"{metres:.1f} m from it: {why}"
+        )
+    if missing.keys() - found.keys():
+        lost += "; begun from the guess"
+    elif missing:
+        lost = ""
+    return {name: found.get(name, T) for name, T in missing.items()}, doubts, lost
+
+
 def _look(instants: Sequence[Instant], guess: Mapping[str, Array | None], base: str) -> Views:
     T_base_lidar = {base: np.eye(4), **guess}
-    return look({n: [each.at_stamp(n, T) for each in instants] for n, T in T_base_lidar.items()})
+    views = look({n: [each.at_stamp(n, T) for each in instants] for n, T in T_base_lidar.items()})
+    for name, of in views.items():
+        half_m = np.median(np.concatenate([np.linalg.norm(v.points_m, axis=1) for v in of]))
+        if half_m > _MOST_HALF_M:
+            raise DatasetError(
+                f"half of the points of LiDAR {name!r} are farther than {half_m:,.0f} m: write its "
+                "clouds in metres"
+            )
+    return views
 
 
 def _solve(
@@ -191,6 +242,53 @@ def _solve(
         poses = calibrate_lidars(seen, start, base=base, place_sigmas=sigmas)
         start = {name: T for name, T in poses.T_base_lidar.items() if name != base}
     return poses
+
+
+def _with_clock_errors(
+    drive: Drive, instants: Sequence[Instant], seen: Sequence[View], poses: LidarPoses
+) -> tuple[LidarPoses, list[str]]:
+    """The poses with what clouds of other times do alike at all places, and a line on it.
+
+    That is so while the vehicle moves on steadily and is not known to move. As far as steps between
+    frames differ, it shows in what places differ by. Steps are by planes of the base.
+    """
+    if any(each.twist_per_s is not None for each in instants):
+        return poses, []
+    pairs = [
+        (i.frame, view.planes)
+        for i, view in zip(instants, seen, strict=True)
+        if len(two := drive.frames[i.frame : i.frame + 2]) > 1
+        and (seconds_between(*two) is None or scans_beside(two, 0))
+    ]
+    steps = [_step_after(drive, *pair, poses.base) for pair in spread_out(pairs, _PAIRS)]
+    known = [step for step in steps if step is not None]
+    if not known or len(known) < len(steps):
+        return poses, []
+    mean, apart = np.mean(known, axis=0), poses.places * np.var(known, axis=0)[3:].sum()
+    frames = (_CLOCK_FRAMES**-2 + apart / (poses.place_ratios[1] * PLACE_SIGMAS[3] ** 2)) ** -0.5
+    T = np.array([poses.T_base_lidar[name] for name in poses.covariance])
+    each = frames * np.linalg.solve(step_twists(T), np.kron(np.eye(len(T)), mean[:, None]))
+    way_m = float(np.linalg.norm(mean[3:]))
+    line = (
+        f"the vehicle moves by {100 * way_m:.0f} cm from one cloud to the next, and these are "
+        f"taken as they are: if clouds of an instant are of other times, LiDARs are off; error "
+        f"bars count {frames:.1f} of that; record while it stands, or with stamps and times of "
+        "points"
+    )
+    poses = replace(poses, joint_covariance=poses.joint_covariance + each @ each.T)
+    return poses, [line] if frames * way_m > _CLOCK_M else []
+
+
+def _step_after(drive: Drive, number: int, planes: Planes, base: str) -> Array | None:
+    """(6,) the twist of the base from a frame to the next; None if their planes do not fit."""
+    with suppress(CalibrationError):
+        cloud = drive.instant(number + 1, [base]).at_stamp(base, np.eye(4))
+        both = [[thinned(of, _STEP_PLANES)] for of in (planes, find_planes(cloud))]
+        T, _ = refine_poses(both, np.array([np.eye(4)] * 2), (base, base))
+        near, on = count_matched(both, T)
+        if on[0] > _STEP_SHARE * near[0]:
+            return twist_between(T[1], np.eye(4))
+    return None
 
 
 def _join_by_motion(

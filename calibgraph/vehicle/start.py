@@ -75,14 +75,14 @@ def locate_lidars(
         turned: names of those of whose guess the rotation alone is known.
 
     Raises:
-        CalibrationError: if a LiDAR sees no ground.
+        CalibrationError: if a LiDAR sees no ground, and one has no guess.
     """
     chosen = np.unique(np.linspace(0, len(views[base]) - 1, _INSTANTS).round().astype(int))
     seen = {
         name: [View(of[i].points_m, thinned(of[i].planes, _MOST_PLANES)) for i in chosen]
         for name, of in views.items()
     }
-    T_up = {name: find_upright(name, [view.points_m for view in of]) for name, of in seen.items()}
+    T_up = _find_upright(seen, {base: np.eye(4), **guess})
     known, left, poses = seen[base], [name for name in views if name != base], dict[str, Array]()
     doubts, lost = dict[str, str](), ""
     while left and not lost:
@@ -100,6 +100,21 @@ def locate_lidars(
                 known = [a.joined(b, of.T) for a, b in zip(known, seen[name], strict=True)]
         left = [name for name in left if name not in poses]
     return poses, {name: doubts[name] for name in poses if doubts[name]}, lost
+
+
+def _find_upright(seen: Views, T_guess: Mapping[str, Array | None]) -> dict[str, Array]:
+    """(4, 4) T_up_lidar; of a LiDAR without ground in view by the guesses, if all have one."""
+    found = dict[str, Array]()
+    for name, of in seen.items():
+        try:
+            found[name] = find_upright(name, [view.points_m for view in of])
+        except CalibrationError:
+            if any(T is None for T in T_guess.values()):
+                raise
+    known = {name: T for name, T in T_guess.items() if T is not None}
+    ups = [T_up @ invert(known[name]) for name, T_up in found.items() if name in known]
+    T_up_base = ups[0] if ups else np.eye(4)
+    return {**{name: T_up_base @ T for name, T in known.items()}, **found}
 
 
 def _why_lost(found: Mapping[str, _Placement], placed: Sequence[str]) -> str:
@@ -149,9 +164,7 @@ def _placements(
         elif np.isinf(score[heading, i, j]):
             break
         refined = _refined(known, own, start, T_up_base[2, :3])
-        found += [
-            each for each in refined if guess is None or _is_near(each.T, guess, _NEAR_DEG, _NEAR_M)
-        ]
+        found += [each for each in refined if guess is None or is_near(each.T, guess)]
         for T in (start, *(each.T for each in refined)):
             angles, shifted = away(T)
             score[(angles <= _PEAK_DEG)[:, None, None] & (shifted <= _PEAK_M)] = -np.inf
@@ -217,21 +230,24 @@ def _best(tried: Sequence[_Placement], guess: Array | None) -> tuple[_Placement,
     best = max(tried, key=lambda each: each.score, default=_Placement(0, 0.0, np.eye(4)))
     as_good = [each for each in tried if each.score >= _AS_GOOD * best.score]
     if guess is not None and any(
-        not _is_near(each.T, best.T, _OTHER_DEG, _OTHER_M) for each in as_good
+        not is_near(each.T, best.T, _OTHER_DEG, _OTHER_M) for each in as_good
     ):
         best = min(as_good, key=lambda each: np.linalg.norm(each.T[:3, 3] - guess[:3, 3]))
-    others = [each for each in as_good if not _is_near(each.T, best.T, _OTHER_DEG, _OTHER_M)]
+    others = [each for each in as_good if not is_near(each.T, best.T, _OTHER_DEG, _OTHER_M)]
     if not others:
         return best, ""
-    degrees, metres = max(_apart(each.T, best.T) for each in others)
+    degrees, metres = max(distance_between(each.T, best.T) for each in others)
     return best, f"turned by {degrees:.0f} deg and moved by {metres:.1f} m it fits as well"
 
 
-def _apart(T_base_lidar: Array, other: Array) -> tuple[float, float]:
+def distance_between(T_base_lidar: Array, other: Array) -> tuple[float, float]:
     """How far apart two placements are [deg, m]."""
     degrees = angle_deg(T_base_lidar[:3, :3] @ other[:3, :3].T)
     return degrees, float(np.linalg.norm(T_base_lidar[:3, 3] - other[:3, 3]))
 
 
-def _is_near(T_base_lidar: Array, other: Array, deg: float, metres: float) -> bool:
-    return bool((np.array(_apart(T_base_lidar, other)) <= (deg, metres)).all())
+def is_near(
+    T_base_lidar: Array, other: Array, deg: float = _NEAR_DEG, metres: float = _NEAR_M
+) -> bool:
+    """Whether a placement is near another one; by default, as near as to a guess."""
+    return bool((np.array(distance_between(T_base_lidar, other)) <= (deg, metres)).all())

@@ -31,6 +31,7 @@ CELL_M = 4.0
 _CELL_NUMBERS = np.array([1, 2**12, 2**24])  # of steps along x, y, z: 2,048 either way
 _PLACE_NUMBER = 2**40
 _RELIABLE = 0.8  # of H over H without errors of normals: at places that determine all, over 0.9
+_RIDGE = 1e-9  # of a sum's largest entries
 _DETERMINED = 0.1  # of the same, over all pairs
 
 
@@ -65,7 +66,7 @@ class Sums:
 
     def basis(self) -> Array:
         """(d, q) directions that all pairs together determine."""
-        values, vectors = scipy.linalg.eigh(self.hessian.sum(axis=0), self.metric)
+        values, vectors = scipy.linalg.eigh(self.hessian.sum(axis=0), _ridged(self.metric))
         return np.asarray(vectors[:, values > _DETERMINED])
 
 
@@ -152,7 +153,12 @@ def _added(rows: NDArray[np.int64], values: Array) -> Array:
 
 def _reliable(hessian: Array, whole: Array) -> Array:
     """(6, 6) projection of twists onto directions in which normals hold, along the others."""
-    ridge = 1e-12 * np.diag(np.diag(whole)) + np.finfo(float).tiny * np.eye(6)
-    values, vectors = scipy.linalg.eigh(hessian, whole + ridge)
+    values, vectors = scipy.linalg.eigh(hessian, _ridged(whole))
     kept = vectors[:, values > _RELIABLE]
     return np.asarray(kept @ kept.T @ whole)
+
+
+def _ridged(whole: Array) -> Array:
+    """A sum that is positive definite: of exact planes it may be singular."""
+    largest = np.diag(whole).reshape(-1, 3).max(axis=1)  # of turns, of shifts
+    return np.asarray(whole + np.diag(_RIDGE * np.repeat(largest, 3) + np.finfo(float).tiny))

@@ -177,6 +177,28 @@ def test_clouds_that_share_nothing_are_refused_with_their_share():
         calibrate_lidars(look(clouds), MOUNTS, base="top")
 
 
+def test_a_lidar_without_ground_near_it_is_placed_by_its_guess():
+    clouds = record(2, places=1, mounts=TWO)
+    clouds["top"] = [of[np.linalg.norm(of, axis=1) > 15.0] for of in clouds["top"]]
+    guess = {"left": displaced(MOUNTS["left"], 3, 3.0, 0.1)}
+    views = look(clouds)
+    start, _, lost = locate_lidars(views, guess, base="top")
+    assert not lost
+    found = calibrate_lidars(views, start, base="top")
+    off = np.abs(errors(found, "left", MOUNTS["left"]))
+    assert off[:3].max() < np.radians(0.2) and (off < 4 * sigmas(found, "left")).all()
+
+
+def test_planes_without_any_noise_are_no_failure():
+    two = {name: MOUNTS[name] for name in ("top", "front")}
+    at, rng = transform(np.eye(3), [0.0, 0.0, HEIGHT_M]), np.random.default_rng(0)
+    clouds = {
+        name: [scan(np.empty((0, 2, 3)), at @ T, rng, noise_m=0.0)] for name, T in two.items()
+    }
+    bar = sigmas(calibrate_lidars(look(clouds), two, base="top"), "front")
+    assert (bar[[0, 1, 5]] < [0.01, 0.01, 0.1]).all() and (bar[2:5] > [0.1, 0.5, 0.5]).all()
+
+
 def test_the_centre_of_a_plane_lies_on_it_and_single_rings_are_no_planes():
     rng = np.random.default_rng(0)
     cloud = scan(flat_street(), transform(np.eye(3), [0.0, 0.0, 1.8]), rng, noise_m=0.0)

@@ -21,11 +21,12 @@ from calibgraph.model.geometry import transform
 from calibgraph.report.html import render_page
 from calibgraph.report.tables import print_result
 from tests.conftest import SAMPLE, Call, require_poses
-from tests.vehicle.scenes import MOUNTS, displaced, record
+from tests.vehicle.scenes import HEIGHT_M, MOUNTS, displaced, draw_place, record, scan
 
 RIG = {"format": "calibgraph-rig/1", "lidar": "top", "lidars": {name: {} for name in MOUNTS}}
 
 
+AZIMUTHS_DEG = np.arange(-180.0, 180.0, 2.0)
 SAMPLE_RIG = (SAMPLE / "rig.yaml").read_text()
 
 
@@ -90,6 +91,46 @@ def test_a_result_is_read_as_it_was_written(result: Calibration, tmp_path: Path)
     path.write_text(yaml.safe_dump(content))
     with pytest.raises(FileError, match="verdict WARN of LiDAR 'left', its checks give PASS"):
         calibgraph.load_calibration(path)
+
+
+def test_a_lidar_that_does_not_fit_its_guess_is_found_without_and_named(tmp_path: Path):
+    in_mm = MOUNTS["left"].copy()
+    in_mm[:3, 3] *= 1000.0
+    lidars = {"top": {}, "left": {"T_base_lidar": in_mm.tolist()}}
+    write_vehicle(tmp_path, seed=2, places=1, without="front", lidars=lidars)
+    found = calibgraph.calibrate(tmp_path)
+    assert np.abs(found.T_base_lidar["left"] - MOUNTS["left"]).max() < 0.01
+    assert found.verdict.status == "WARN" and not found.warnings
+    assert "it does not fit its guess, but turned by 0 deg and moved by 1" in " ".join(
+        found.verdicts["left"].reasons
+    )
+
+
+def test_clouds_in_millimetres_are_refused(tmp_path: Path):
+    write_vehicle(tmp_path, places=1, without="front")
+    for path in (tmp_path / "lidars" / "left").iterdir():
+        np.save(path, 1000.0 * np.load(path))
+    with pytest.raises(DatasetError, match="LiDAR 'left' are farther than .* in metres"):
+        calibgraph.calibrate(tmp_path)
+
+
+def test_clouds_of_a_drive_that_are_a_frame_late_are_no_pass(tmp_path: Path):
+    rng, boxes, step = np.random.default_rng(3), draw_place(np.random.default_rng(1)), 0.2
+    for name, late in (("top", 0.0), ("left", 1.0)):
+        (tmp_path / "lidars" / name).mkdir(parents=True)
+        for number in range(2):
+            at = transform(np.eye(3), [step * (number - late), 0.0, HEIGHT_M])
+            cloud = scan(boxes, at @ MOUNTS[name], rng, beams=14, azimuths_deg=AZIMUTHS_DEG)
+            np.save(tmp_path / "lidars" / name / f"{number}.npy", cloud)
+    guess = {"T_base_lidar": MOUNTS["left"].tolist()}
+    (tmp_path / "rig.yaml").write_text(
+        yaml.safe_dump({**RIG, "lidars": {"top": {}, "left": guess}})
+    )
+    found = calibgraph.calibrate(tmp_path)
+    off = found.T_base_lidar["left"][0, 3] - MOUNTS["left"][0, 3]
+    assert abs(off) > 0.15, "the way of a frame"
+    assert found.sigmas("left")[1][0] > 100.0 * step / 2.5 and found.verdict.status == "WARN"
+    assert "moves by 20 cm from one cloud to the next" in found.warnings[0]
 
 
 def test_the_report_has_a_table_of_lidars(result: Calibration):
