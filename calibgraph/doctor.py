@@ -75,7 +75,7 @@ class Diagnosis:
 
 
 def diagnose(
-    folders: Sequence[Path],
+    folders: Path | str | Sequence[Path | str],
     rig: Rig | None = None,
     *,
     frames: str | None = None,
@@ -85,7 +85,7 @@ def diagnose(
     """Examine a dataset in seconds: of many frames, those that a calibration would match.
 
     Args:
-        folders: dataset folders, KITTI odometry sequences or bags of one rig.
+        folders: a dataset folder, KITTI odometry sequence or bag, or several of one rig.
         rig: the guess; the data's own if None.
         frames: which frames to keep, see :meth:`calibgraph.Dataset.select`.
         bag: how ROS bags are read.
@@ -96,7 +96,8 @@ def diagnose(
         ValueError: if the options do not fit.
     """
     found: _Found = {"error": [], "warning": [], "note": []}
-    data = _load(folders, rig, found, frames=frames, bag=bag)
+    paths = [*map(Path, [folders] if isinstance(folders, (str, Path)) else folders)]
+    data = _load(paths, rig, found, frames=frames, bag=bag)
     count, seen, written = 0, dict[str, int](), list[Path]()
     if data is not None:
         count = len(data.frames)

@@ -57,13 +57,15 @@ def require_new_file(path: Path, *suffixes: str, force: bool = False) -> None:
 
     Raises:
         FileError: if it is a folder, if a folder above it is a file or not writable, if it ends in
-            none of the suffixes, or if it is there, without force.
+            none of the suffixes, if it is there, without force or as that of a result.
     """
     if suffixes and path.suffix not in suffixes:
         raise FileError(path, f"the name of what is written must end in {' or '.join(suffixes)}")
     if path.is_dir():
         raise FileError(path, "is a folder, expected the name of a file to write")
     require_place_for_folder(path.parent)
+    if path.name == INDEX_FILES[0] and path.exists():
+        raise FileError(path, "is the main file of a result; choose another name")
     if os.path.lexists(path) and not force:
         raise FileError(path, "is there already; choose another name, or replace it with --force")
 
@@ -287,9 +289,14 @@ _DECIMAL_COMMA = re.compile(r"[-+]?[0-9]+,[0-9]+(e[-+]?[0-9]+)?")
 
 def describe(error: ValidationError) -> str:
     """First problem of a pydantic error, in one line; a misspelt key before a missing one."""
-    first = min(error.errors(), key=lambda problem: problem["type"] != "extra_forbidden")
+    problems = error.errors()
+    first = min(problems, key=lambda problem: problem["type"] != "extra_forbidden")
     where = ".".join(str(part) for part in first["loc"])
     if first["type"] == "extra_forbidden":
+        inverse = re.sub("T_([^_]+)_([^_]+)", r"T_\2_\1", str(first["loc"][-1]))
+        missing = [each["loc"] for each in problems if each["type"] == "missing"]
+        if (*first["loc"][:-1], inverse) in missing:
+            return f"unknown key {where!r}; give its inverse, {inverse}"
         return f"unknown key {where!r}; remove it or correct its spelling"
     if first["type"] == "missing":
         return f"key {where!r} is missing; add it"

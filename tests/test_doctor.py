@@ -35,7 +35,7 @@ def test_damaged_sources_are_listed_with_the_frames_that_do_not_pair(folder: Pat
         path.write_bytes(path.read_bytes()[:-50])
     (folder / "lidar/000003.npy").write_bytes(b"nothing")
     cv2.imwrite(str(folder / "cameras/left/000005.jpg"), np.zeros((360, 640, 3), np.uint8))
-    found = diagnose([folder], pictures=folder / "pictures")
+    found = diagnose(str(folder), pictures=folder / "pictures")
     errors = texts(found, "error")
     assert not found.healthy
     assert [finding.level for finding in found.findings[: len(errors)]] == ["error"] * len(errors)

@@ -19,10 +19,12 @@ LINE_EVERY_S = 5.0
 """The least time before the first line of progress and between two: short work is silent."""
 
 
-def terminal() -> Console:
+def terminal(least_columns: int = 80) -> Console:
     """A console on stderr, on which a reader that has gone is no error; stdout is for JSON.
 
     What is printed can do no more than be seen: names of files and fields are those of others.
+    Lines that are longer than a narrow terminal are wrapped by it: tables without names and digits
+    are of no use.
     """
     from rich.console import Console
     from rich.segment import Segment
@@ -40,7 +42,9 @@ def terminal() -> Console:
             self.quiet = True
             discard(sys.stderr)
 
-    return Stderr(stderr=True)
+    console = Stderr(stderr=True)
+    console.width = max(console.width, least_columns)
+    return console
 
 
 def print_line(*lines: str) -> None:
@@ -60,7 +64,7 @@ def progress_bar(first: str = "starting") -> Iterator[Progress]:
 
     Warnings that the work logs are printed, a line each.
     """
-    console = terminal()
+    console = terminal(least_columns=0)  # a bar is redrawn, and must not be wrapped
     if not console.is_terminal:
         with _printed_warnings(console):
             yield progress_lines(print_line)

@@ -30,13 +30,13 @@ class Settings(StrictNumbers):
 
     Attributes:
         frames: of a recording, as of ``--frames``.
-        search_deg, search_m: how far off the guess may be; None: the matcher's default.
+        search_deg, search_m: how far off the guess may be; 0: no search; None: the default.
     """
 
     config: Config = Config()
     frames: str | None = None
-    search_deg: float | None = Field(default=None, gt=0)
-    search_m: float | None = Field(default=None, gt=0)
+    search_deg: float | None = Field(default=None, ge=0)
+    search_m: float | None = Field(default=None, ge=0)
 
 
 @dataclass(frozen=True)

@@ -184,7 +184,7 @@ class Calibration:
         """
         if self.build_graph is None:
             raise ValueError(
-                "a result from a file or another process has no graph; solve its table again"
+                "a result of a tracker, a file or another process has no graph; solve a table"
             )
         return self.build_graph()
 

@@ -134,8 +134,8 @@ def require_in_reach(T_camera_lidar: Transforms) -> None:
     for name, T in T_camera_lidar.items():
         if not (away_m := np.abs(T[:3, 3]).max()) <= MAX_COORDINATE:
             raise CorrespondenceError(
-                f"its correspondences place it {away_m:.2g} m away: they determine no extrinsic; "
-                "check which pixels and points belong together",
+                f"camera {name!r}: its correspondences place it {away_m:.2g} m away: they "
+                "determine no extrinsic; check which pixels and points belong together",
                 camera=name,
             )
 

@@ -12,6 +12,7 @@ from rich.table import Table
 
 from calibgraph.cli import terminal
 from calibgraph.cli.terminal import LINE_EVERY_S, progress_lines
+from calibgraph.report.tables import make_table
 from tests.conftest import SAMPLE, Call
 
 EVALUATE = f"evaluate {SAMPLE} {SAMPLE}/reference.yaml"
@@ -83,6 +84,14 @@ def test_names_of_others_do_nothing_to_a_terminal(monkeypatch: pytest.MonkeyPatc
     shown = screen.getvalue()
     assert shown.count("a\\x1b[2Jb") == 4
     assert all(line.isprintable() for line in shown.splitlines())
+
+
+def test_tables_are_whole_on_a_narrow_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    screen, row = io.StringIO(), ["front_left", *["-179.999"] * 6]
+    monkeypatch.setattr("sys.stderr", screen)
+    monkeypatch.setenv("COLUMNS", "40")
+    terminal.terminal().print(make_table("Error bar", [row]))
+    assert row in [line.split() for line in screen.getvalue().splitlines()]
 
 
 def test_a_file_name_in_an_error_does_nothing_to_a_terminal(call: Call) -> None:

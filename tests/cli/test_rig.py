@@ -12,7 +12,7 @@ import yaml
 
 from calibgraph import load_calibration, load_rig, write_rig_template
 from tests.cli.conftest import error_line
-from tests.conftest import SAMPLE, Call, require_near, require_poses
+from tests.conftest import ROOT, SAMPLE, Call, require_near, require_poses
 from tests.io.bags.writing import (
     START_NS,
     Messages,
@@ -140,7 +140,7 @@ def test_files_of_others_make_a_rig_and_print_a_sentence_per_camera(
     code, stdout, err = call("rig", *words.split(), "--out", "rig.yaml")
     assert (code, stdout) == (0, ""), err
     assert said.format(sentence=SENTENCE) in " ".join(err.split())
-    assert err.splitlines()[-1].startswith("rig.yaml: written; check")
+    assert f"\n{err.splitlines()[-1]}\n```" in (ROOT / "docs/formats.md").read_text()
     assert [*load_rig("rig.yaml").cameras] == names.split()
 
 

@@ -82,12 +82,16 @@ def test_a_table_that_the_result_beside_it_does_not_name_is_not_replaced(
     assert load_rig(folder / "out").cameras  # the extrinsics can be used without the table
 
 
-def test_force_replaces_a_file(folder: Path, call: Call) -> None:
+def test_force_replaces_a_file_but_no_result(folder: Path, call: Call) -> None:
     out = folder / "truth.yaml"
     assert call("perturb", folder / "rig.yaml", "--seed", 3, "--out", out, "--force")[0] == 0
     made = out.read_text()
     assert call("rig", folder / "rig.yaml", "--out", out, "--force")[0] == 0
     assert out.read_text() != made
+    result = out.rename(out.with_name("calibration.yaml"))
+    for words in (["perturb"], ["export", "--format", "json"]):
+        found = call(words[0], result, *words[1:], "--out", result, "--force")
+        assert "is the main file of a result" in error_line(*found)
 
 
 @pytest.mark.usefixtures("no_image_checks")

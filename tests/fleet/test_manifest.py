@@ -16,16 +16,16 @@ def write(folder: Path, text: str, name: str = "fleet.csv") -> str:
 
 
 def test_csv_and_parquet_give_the_same_jobs(tmp_path: Path) -> None:
-    csv = write(tmp_path, HEAD + '001,a;b,rig.yaml,"{seed: 3, search_deg: 5}",12.5\n')
+    csv = write(tmp_path, HEAD + '001,a;b,rig.yaml,"{seed: 3, search_deg: 0}",12.5\n')
     cells = {"vehicle": ["001"], "recording": ["a;b"], "rig": ["rig.yaml"],
-             "settings": ["{seed: 3, search_deg: 5}"], "mileage_km": [12.5]}  # fmt: skip
+             "settings": ["{seed: 3, search_deg: 0}"], "mileage_km": [12.5]}  # fmt: skip
     parquet.write_table(pa.table(cells), tmp_path / "fleet.parquet")
     found = [load_manifest(uri) for uri in (csv, str(tmp_path / "fleet.parquet"))]
     assert found[0][0] == found[1][0]
     (job,) = found[0][0]
     assert job.vehicle == "001"
     assert job.recordings == (f"{tmp_path}/a", f"{tmp_path}/b")
-    assert (job.settings.config.seed, job.settings.search_deg) == (3, 5.0)
+    assert (job.settings.config.seed, job.settings.search_deg) == (3, 0.0)
     assert all(others.to_pylist() == [{"mileage_km": 12.5}] for _, others in found)
 
 

@@ -19,9 +19,10 @@ from tests.conftest import SAMPLE, stereo_relative_pose
 
 
 def written(rig: Rig, folder: Path, **changes: Any) -> Path:
-    """A rig file with some keys of its camera `left` changed."""
+    """A rig file with some keys of its camera `left` changed, or left out if they are None."""
     content = rig.model_dump(mode="json")
-    content["cameras"]["left"] |= changes
+    left = content["cameras"]["left"] | changes
+    content["cameras"]["left"] = {key: value for key, value in left.items() if value is not None}
     path = folder / "rig.yaml"
     path.write_text(yaml.safe_dump(content))
     return path
@@ -36,6 +37,10 @@ def test_a_rig_file_returns_the_same_rig(pair: Rig, tmp_path: Path) -> None:
 
 BAD = {
     "unknown key": ({"fov": 90}, r"unknown key 'cameras.left.fov'"),
+    "inverse": (
+        {"T_camera_lidar": None, "T_lidar_camera": np.eye(4).tolist()},
+        r"unknown key 'cameras.left.T_lidar_camera'; give its inverse, T_camera_lidar",
+    ),
     "focal length": (
         {"intrinsics_px": {"fx": -1, "fy": 700, "cx": 1, "cy": 1}},
         r"intrinsics_px.fx.*-1",

@@ -65,8 +65,8 @@ class StructureMatcher:
 
     Args:
         seed: of the searches.
-        search_deg: largest error of the guess, per axis [deg]; None for no search: the rounds begin
-            at the guess, which may be off by about 2.5 degrees and 25 cm.
+        search_deg: largest error of the guess, per axis [deg]; 0 or None for no search: the rounds
+            begin at the guess, which may be off by about 2.5 degrees and 25 cm.
         search_m: the same of the translation [m].
         most_frames: most frames of a dataset that are used, chosen of more; None for all.
         levels: the rounds, coarse to fine.
@@ -259,14 +259,14 @@ class StructureMatcher:
 
 def _to_search_range(search_deg: float | None, search_m: float | None) -> SearchRange | None:
     """The range of the search, None for no search."""
-    if search_deg is None and search_m is None:
+    if not search_deg and not search_m:
         return None
     if search_deg is None or search_m is None:
         raise ValueError("give both ranges of the search, or None for both")
     if not (0 < search_deg <= MAX_SEARCH_DEG and 0 < search_m <= MAX_SEARCH_M):
         raise ValueError(
             f"the search reaches up to {MAX_SEARCH_DEG:g} deg and {MAX_SEARCH_M:g} m per axis, "
-            f"found {search_deg:g} deg and {search_m:g} m"
+            f"found {search_deg:g} deg and {search_m:g} m; give 0 for both to search nothing"
         )
     return float(np.radians(search_deg)), search_m
 

@@ -14,7 +14,7 @@ from calibgraph.matching.structure.schedule import Level
 
 def without_search(levels: Sequence[Level]) -> StructureMatcher:
     """The matcher that begins at the guess."""
-    return StructureMatcher(search_deg=None, search_m=None, levels=levels)
+    return StructureMatcher(search_deg=0, search_m=0, levels=levels)
 
 
 def far_from(truth: Rig, seed: int) -> Rig:

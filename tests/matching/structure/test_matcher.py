@@ -166,6 +166,7 @@ def test_a_result_of_fewer_rounds_is_partial() -> None:
         ({"search_m": None}, "both ranges"),
         ({"search_deg": 90.0}, "up to 45 deg"),
         ({"search_m": -1.0}, "found 20 deg and -1 m"),
+        ({"search_deg": 0.0}, "found 0 deg and 1.5 m; give 0 for both"),
         ({"search_m": float("nan")}, "found 20 deg and nan m"),
     ],
 )
