@@ -22,7 +22,7 @@ from calibgraph.audit.judgement import (
 from calibgraph.audit.lidars import measure_lidars
 from calibgraph.audit.result import Audit, CameraAudit
 from calibgraph.errors import CorrespondenceError, FileError
-from calibgraph.io.calibrations import stated_result
+from calibgraph.io.calibrations import StatedResult, stated_result
 from calibgraph.io.dataset import Dataset, keep_frames, load_dataset
 from calibgraph.io.frame import hash_source
 from calibgraph.io.rigs import load_rig
@@ -94,7 +94,8 @@ def check(
 
     Args:
         rig: the deployed calibration, of alignments. For the path of a result, the audit also has
-            the result's verdict, and whether it was made from this recording.
+            the result's verdict, and whether it was made from this recording; clouds are of one
+            instant if the result's are (``instant_clouds``).
         dataset: a recent recording: a dataset, its folder, a KITTI odometry sequence, or several.
         tolerance_deg: largest turn of a camera that is OK.
         tolerance_cm: largest shift of a camera that is OK.
@@ -116,7 +117,9 @@ def check(
     loaded = rig if isinstance(rig, Rig) else load_rig(rig)
     deployed = loaded.model_copy(update={"relative_poses": ()})
     given = dataset if isinstance(dataset, Dataset) else load_dataset(dataset, deployed)
-    same_recording, verdict = (False, None) if isinstance(rig, Rig) else provenance(rig, given)
+    same_recording, stated = (False, None) if isinstance(rig, Rig) else provenance(rig, given)
+    if stated is not None and stated.instant_clouds:
+        given = given.at_instants()
     measured = list[Measured]()
     if deployed.other_lidars:
         with watch("lidars"):
@@ -136,7 +139,8 @@ def check(
     return Audit(
         cameras.audits if deployed.cameras else {}, _judge_lidar(measured, tolerance), deployed,
         middle, sources, tolerance_deg, tolerance_cm, len(data.frames), watch.seconds,
-        same_recording, verdict, lidars.audits if deployed.other_lidars else {},
+        same_recording, None if stated is None else stated.status,
+        lidars.audits if deployed.other_lidars else {},
     )  # fmt: skip
 
 
@@ -248,8 +252,8 @@ def _doubt_by_z_score(z_score: float | None) -> str:
     )
 
 
-def provenance(rig: Path | str, data: Dataset) -> tuple[bool, Status | None]:
-    """Whether a recording is the deployed result's own; its verdict, None of other rigs.
+def provenance(rig: Path | str, data: Dataset) -> tuple[bool, StatedResult | None]:
+    """Whether a recording is the deployed result's own; what that states, None of other rigs.
 
     Only clouds with the name of one of its inputs are read.
 
@@ -267,7 +271,7 @@ def provenance(rig: Path | str, data: Dataset) -> tuple[bool, Status | None]:
     names = {Path(source).name for source in result.inputs}
     clouds = (frame.cloud_path for frame in data.frames if frame.cloud_path.name in names)
     same = any(hash_source(cloud) in result.inputs.values() for cloud in clouds)
-    return same, result.status
+    return same, result
 
 
 _REACH_DEG, _REACH_CM = 0.7, 20.0

@@ -222,6 +222,7 @@ class StatedResult(BaseModel):
     verdict: dict[str, Any] = {}
     status: Status | None = Field(None, validation_alias=AliasPath("verdict", "status"))
     of: Reported = Field("alignment", validation_alias=AliasPath("config", "of"))
+    instant_clouds: bool = Field(False, validation_alias=AliasPath("config", "instant_clouds"))
 
     @property
     def hashes(self) -> set[str | None]:

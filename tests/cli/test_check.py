@@ -28,7 +28,8 @@ def measure(rig: Path, data: Dataset, **options: Any) -> Audit:
     """Measure a right rig in one frame once, for the tests of all that is told about it."""
     if not MEASURED:
         MEASURED.append(check(rig, data, **options))
-    same_recording, verdict = provenance(rig, data)
+    same_recording, stated = provenance(rig, data)
+    verdict = None if stated is None else stated.status
     return replace(MEASURED[0], same_recording=same_recording, deployed_verdict=verdict)
 
 

@@ -107,6 +107,9 @@ def test_clouds_corrected_before_are_named_and_are_right_where_that_is_stated(st
     assert result.verdict.status == ("PASS" if stated else "WARN")
     off = result.T_base_lidar["front"][:3, 3] - MOUNTS["front"][:3, 3]
     assert (np.abs(off).max() < 0.01) == stated, off  # else 15 cm, with a bar of 3 mm
+    if stated:
+        audit = calibgraph.check(result.save(tmp_path / "out"), folder)
+        assert np.abs(audit.lidars["front"].deviation[3:]).max() < 0.01
 
 
 def test_instants_that_move_are_left_out_where_points_have_no_times(tmp_path, caplog):
