@@ -247,10 +247,11 @@ def _solve(
 def _with_clock_errors(
     drive: Drive, instants: Sequence[Instant], seen: Sequence[View], poses: LidarPoses
 ) -> tuple[LidarPoses, list[str]]:
-    """The poses with what clouds of other times do alike at all places, and a line on it.
+    """The poses, their error bars wider by what clouds of other times would do, and a line on it.
 
-    That is so while the vehicle moves on steadily and is not known to move. As far as steps between
-    frames differ, it shows in what places differ by. Steps are by planes of the base.
+    Where the vehicle moves on steadily and its motion is not known, such clouds displace a LiDAR
+    alike at all places, and no scatter shows it. As far as steps between frames differ, places do.
+    Steps are by planes of the base.
     """
     is_stated = drive.frames[0].is_instant  # that clouds are of their stamps
     if is_stated or any(each.twist_per_s is not None for each in instants):
