@@ -180,7 +180,7 @@ class Calibration:
         marginal of the error model that the preset ``auto`` fits.
 
         Raises:
-            ValueError: if the result was read from a file, or comes from another process.
+            ValueError: of a result of a tracker, from a file or from another process.
         """
         if self.build_graph is None:
             raise ValueError(
