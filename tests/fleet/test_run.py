@@ -206,8 +206,8 @@ def test_dask_without_its_package_or_scheduler_is_one_line(monkeypatch: pytest.M
 def test_a_killed_command_leaves_rows_that_the_next_one_keeps(tmp_path: Path) -> None:
     manifest, out = str(write_fleet(tmp_path / "in", 12)), tmp_path / "out"
     command = [sys.executable, "-m", "calibgraph", "fleet", manifest, "--out", str(out), "--json"]
-    # Interrupted while it ends, Python ends by the signal itself, which a shell calls 130 as well.
-    codes = {signal.SIGINT: (130, -2, 0), signal.SIGTERM: (130, 0), signal.SIGKILL: (-9, 0)}
+    # Interrupted when all is written, while it ends, it ends by the signal itself.
+    codes = {signal.SIGINT: (130, -2, 0), signal.SIGTERM: (130, -15, 0), signal.SIGKILL: (-9, 0)}
     for stop, allowed in codes.items():
         process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
         published, end = len(files_below(out)), time.monotonic() + 120
