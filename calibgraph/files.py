@@ -57,7 +57,7 @@ def require_new_file(path: Path, *suffixes: str, force: bool = False) -> None:
 
     Raises:
         FileError: if it is a folder, if a folder above it is a file or not writable, if it ends in
-            none of the suffixes, if it is there, without force or as that of a result.
+            none of the suffixes, or if it is there, without force or named as a result's main file.
     """
     if suffixes and path.suffix not in suffixes:
         raise FileError(path, f"the name of what is written must end in {' or '.join(suffixes)}")
@@ -65,7 +65,7 @@ def require_new_file(path: Path, *suffixes: str, force: bool = False) -> None:
         raise FileError(path, "is a folder, expected the name of a file to write")
     require_place_for_folder(path.parent)
     if path.name == INDEX_FILES[0] and path.exists():
-        raise FileError(path, "is the main file of a result; choose another name")
+        raise FileError(path, "has the name of a result's main file; choose another name")
     if os.path.lexists(path) and not force:
         raise FileError(path, "is there already; choose another name, or replace it with --force")
 

@@ -362,8 +362,8 @@ def test_a_second_end_that_agrees_better_is_taken(
     truth: Rig, matched_right: MatchingRun, matched_wrong: MatchingRun,
     beside: bool, z_score: float, taken: bool,
 ) -> None:  # fmt: skip
-    """The camera that is off is tried beside the others, whose relative pose is that of the guess;
-    from a displaced start; and again where that ends far away."""
+    """A camera that is off is matched again: beside the others by the relative pose of the guess,
+    from a displaced start, and once more where that ends far away."""
     wrong = ended_at(matched_wrong, 5.0)
     if not beside:
         wrong = replace(wrong, guess=perturb(truth, rotation_deg=3.0, translation_m=0.3, seed=2))

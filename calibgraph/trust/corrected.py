@@ -54,7 +54,7 @@ def corrected_clouds(data: Dataset) -> str:
 def corrected_twice(
     sweeps: Iterable[tuple[tuple[Array, Array | None], Array | None]], lidar: str
 ) -> str:
-    """A line if points have moved already as they are to be corrected; empty if they have not.
+    """A line if points are corrected for this motion already; empty if they are not.
 
     Args:
         sweeps: (n, 3) points of a LiDAR in its frame with (n,) times [s], and its (6,) twist.
@@ -71,9 +71,9 @@ def corrected_twice(
     if moved < _LEAST or moved <= _CLEARLY * found.count(False):
         return ""
     return (
-        f"{lidar}: the directions of points are not those of their times in {moved} of "
-        f"{len(found)} clouds, which were corrected for motion before. A second correction errs "
-        f"by up to {100 * way_m:.0f} cm: state instant_clouds: true in --config"
+        f"{lidar}: {moved} of {len(found)} clouds were corrected for motion before: the LiDAR did "
+        "not fire where their points are at these times. A second correction errs by up to "
+        f"{100 * way_m:.0f} cm: state instant_clouds: true in --config"
     )
 
 
@@ -95,7 +95,7 @@ def _has_moved(points_m: Array, times_s: Array, twist_per_s: Array) -> bool | No
 
 
 def _as_fired(points_m: Array, times_s: Array, twist_per_s: Array) -> tuple[float, bool]:
-    """The spread of azimuths about those of their times and beams, and whether they are these."""
+    """The spread [rad] of azimuths about what time and beam predict, and if a LiDAR fires so."""
     (x, y, z), r, (vx, vy) = points_m.T, np.hypot(*points_m[:, :2].T), twist_per_s[3:5]
     at_time = ((times_s - times_s.min()) * (_BINS / np.ptp(times_s))).astype(np.int64)
     beams = np.unique(np.floor(np.arctan2(z, r) / _BEAM), return_inverse=True)[1]

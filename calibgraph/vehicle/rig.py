@@ -96,7 +96,7 @@ def calibrate_rig_lidars(
     """The poses of a rig's LiDARs in its base, from clouds of instants.
 
     Where the vehicle is known to move, clouds are brought to one time by the points' times, or left
-    out without these; else they are taken as they are.
+    out without these; else they are taken as they are, with wider error bars on a steady drive.
 
     Args:
         dataset: its frames have the clouds of all LiDARs; those that lack one are left out.
@@ -152,7 +152,8 @@ def calibrate_rig_lidars(
     poses, late = _with_clock_errors(
         drive, instants, views[rig.lidar], join_poses(parts, [rig.lidar, *guess])
     )
-    progress("finding the vehicle's frame", 0, 1)
+    if rig.vehicle is not None:
+        progress("finding the vehicle's frame", 0, 1)
     vehicle, unknown = _find_vehicle(rig.vehicle, instants, poses, path)
     twice = _corrected_twice(instants, poses.T_base_lidar)
     warnings += [*late, *unknown, *twice]
@@ -201,7 +202,7 @@ def _begin(
     for name in missing.keys() & found.keys():
         degrees, metres = distance_between(found[name], missing[name])
         others = [n for n, T in guess.items() if T is not None and is_near(found[name], T)]
-        why = f"are its clouds those of {others[0]}?" if others else (
+        why = f"does it have the clouds of {others[0]}?" if others else (
             "is that p_base = T_base_lidar * p_lidar, in metres, and are the clouds its own?"
         )  # fmt: skip
         doubts[name] = (

@@ -91,7 +91,7 @@ def test_force_replaces_a_file_but_no_result(folder: Path, call: Call) -> None:
     result = out.rename(out.with_name("calibration.yaml"))
     for words in (["perturb"], ["export", "--format", "json"]):
         found = call(words[0], result, *words[1:], "--out", result, "--force")
-        assert "is the main file of a result" in error_line(*found)
+        assert "has the name of a result's main file" in error_line(*found)
 
 
 @pytest.mark.usefixtures("no_image_checks")

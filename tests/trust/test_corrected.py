@@ -36,7 +36,7 @@ def test_clouds_that_were_corrected_are_named():
         )
     ]
     line = corrected_twice(found, "top")
-    assert line.startswith("top: the directions of points are not those of their times in 3 of 3")
+    assert line.startswith("top: 3 of 3 clouds were corrected for motion before")
     assert "errs by up to 80 cm: state instant_clouds: true in --config" in line
     assert not corrected_twice(found[:1], "top"), "one is thin evidence"
     assert not corrected_twice([*found, *raw_sweeps(SPEED_M_S)], "top"), "of both kinds"
