@@ -8,12 +8,16 @@ a camera's places are: the sum of I_p - I_p (I_p + D^-1)^-1 I_p is the informati
 sizes in D are REML estimates (Schall), about a prior. Errors over their own estimated size scatter
 more than over the true one, (1 + 2 f / (f + f_0)^2) with f degrees of freedom and f_0 of the prior:
 the covariance is wider by that.
+
+Ranges of a LiDAR may all be too long by so much. What is to be added to each is a column as well,
+with a prior, that all places share: where walls ahead and beside show it, it is estimated, else the
+covariance of poses is wider by it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import permutations
 
 import numpy as np
@@ -25,7 +29,7 @@ from scipy.spatial.transform import Rotation
 from calibgraph.arrays import Array
 from calibgraph.errors import CalibrationError
 from calibgraph.model.geometry import rows_of_poses
-from calibgraph.vehicle.planes import Planes, Views, moved
+from calibgraph.vehicle.planes import Planes, Views, lengthened, moved
 from calibgraph.vehicle.sums import MATCH, Matches, Sums, residuals_m, sum_up
 
 _GATES_M = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18, 0.13)  # of the residuals, while the poses converge
@@ -48,6 +52,9 @@ PLACE_FREEDOM = 1.0
 errors have squares of 0.6 to 1.3 of the variance; with 3 it is 0.4 to 1.6."""
 GUESS_SIGMAS = np.repeat([np.radians(10.0), 1.0], 3)
 """(6,) [rad, m] of a direction that no plane determines."""
+RANGE_SIGMA_M = 0.01
+"""Standard deviation of what a LiDAR adds to all its ranges: data sheets state 1 to 3 cm."""
+_SAME_OFFSET_M, _MOST_OFFSETS = 0.002, 4  # of it: what is as good, and rounds
 _EXACT = 1e-18  # [m^2, rad^2] least variance, for rounding
 _LEAST_VARIANCE = 1e-9  # [m^2] of residuals: without, exact scans determine more than numbers hold
 _SETTLED, _MOST_STEPS = 0.01, 50  # of REML
@@ -65,6 +72,8 @@ class LidarPoses:
             that cameras place.
         places: instants between which the vehicle has moved.
         place_ratios: variance of rotation and translation between places over its prior.
+        longer_m: per LiDAR on planes, by how much it measures longer ranges than the base, and the
+            sigma of that.
     """
 
     base: str
@@ -73,6 +82,7 @@ class LidarPoses:
     matched: Mapping[str, float]
     places: int
     place_ratios: tuple[float, float]
+    longer_m: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
     def covariance(self) -> dict[str, Array]:
@@ -116,18 +126,31 @@ def calibrate_lidars(
     kept = _distinct(planes[0])
     planes = [[of[i] for i in kept] for of in planes]
     T = np.array([np.eye(4), *(np.asarray(T_base_lidar[name], np.float64) for name in names[1:])])
-    T, _ = refine_poses(planes, T, names)
-    places = [_at_place([of[i : i + 1] for of in planes], T, names) for i in range(len(planes[0]))]
-    step, joint, ratios = combine_places(places, place_sigmas)
-    T = _stepped(T, step)
-    near, on = count_matched(planes, T)
+    added_m, first, poses = np.zeros(len(names)), 0, 6 * len(names) - 6
+    for _ in range(_MOST_OFFSETS):
+        at = [
+            [lengthened(own, metres) for own in of]
+            for of, metres in zip(planes, added_m, strict=True)
+        ]
+        T, _ = refine_poses(at, T, names, first=first)
+        places = [_at_place([of[i : i + 1] for of in at], T, names) for i in range(len(kept))]
+        step, joint, ratios = combine_places(places, place_sigmas, added_m)
+        T, first = _stepped(T, step[:poses]), _AT_PLACE
+        added_m = added_m + step[poses:]
+        if np.abs(step[poses:]).max() < _SAME_OFFSET_M:
+            break
+    near, on = count_matched(at, T)
+    against = np.hstack([np.ones((len(names) - 1, 1)), -np.eye(len(names) - 1)])  # the base
+    sigmas_m = np.sqrt(np.diag(against @ joint[poses:, poses:] @ against.T))
+    longer_m = zip((against @ added_m).tolist(), sigmas_m.tolist(), strict=True)
     return LidarPoses(
         base,
         dict(zip(names, T, strict=True)),
-        joint,
+        joint[:poses, :poses],
         dict(zip(names, (on / near).tolist(), strict=True)),
         len(places),
         ratios,
+        dict(zip(names[1:], longer_m, strict=True)),
     )
 
 
@@ -149,6 +172,7 @@ def join_poses(parts: Sequence[LidarPoses], names: Sequence[str]) -> LidarPoses:
         {name: part.matched[name] for name, part in of.items() if name in part.matched},
         min(part.places for part in parts),
         (max(p.place_ratios[0] for p in parts), max(p.place_ratios[1] for p in parts)),
+        {name: part.longer_m[name] for name, part in of.items() if name in part.longer_m},
     )
 
 
@@ -173,7 +197,7 @@ def refine_poses(
         matches = found[_are_same(found, gate_m, cosine)]
         _require_overlap(matches, names)
         sums = sum_up(matches, T, _scale_m(matches, 0.0 if is_last else _WIDTH * gate_m))
-        step = _step(sums)
+        step = _step(sums.of_poses)
         T = _stepped(T, step)
         if is_last and np.abs(step).max() < _CONVERGED:
             break
@@ -287,20 +311,22 @@ def _at_place(
     leaving it out (the jackknife): a direction that hangs by one cell is determined by none. A
     place with too few matches has no information.
     """
-    size = 6 * (len(names) - 1)
+    size = 7 * len(names) - 6
     try:
         T, sums = refine_poses(planes, T_base_lidar, names, first=_AT_PLACE)
     except CalibrationError:
         return np.zeros((size, size)), np.zeros(size)
-    basis = sums.basis()
+    basis, step = sums.basis(), _step(sums)
     whole = sums.hessian.sum(axis=0) @ basis  # (d, q)
     hessian, cells = basis.T @ whole, basis.T @ sums.hessian @ basis
-    gradients = (sums.gradient @ basis)[:, :, None]
+    gradients = ((sums.gradient + sums.hessian @ step) @ basis)[:, :, None]
     apart = np.linalg.solve(hessian - cells, gradients)[:, :, 0]  # of a fit without the cell
     root = np.linalg.cholesky(_shrunk(apart, hessian) + _LEAST_VARIANCE * np.eye(len(hessian)))
     seen = np.linalg.solve(hessian, whole.T)
     by = scipy.linalg.solve_triangular(root, seen, lower=True)  # (q, d)
-    return by.T @ by, by.T @ by @ _steps_between(T_base_lidar, T)
+    poses = _steps_between(T_base_lidar, T)
+    step[: len(poses)] += poses
+    return by.T @ by, by.T @ by @ step
 
 
 def _shrunk(apart: Array, hessian: Array) -> Array:
@@ -325,33 +351,38 @@ def _steps_between(T_base_lidar: Array, others: Array) -> Array:
 
 
 def combine_places(
-    places: Sequence[tuple[Array, Array]], place_sigmas: Array = PLACE_SIGMAS
+    places: Sequence[tuple[Array, Array]], place_sigmas: Array, added_m: Array
 ) -> tuple[Array, Array, tuple[float, float]]:
-    """(d,) step to the optimum over places, its (d, d) covariance, and the ratios of D."""
+    """(d,) step to the optimum over places, its (d, d) covariance, and the ratios of D.
+
+    With (k,) what has been added to the ranges of each LiDAR.
+    """
     informations, vectors = map(np.array, zip(*places, strict=True))
     size = len(vectors[0])
-    is_turn = np.tile([True] * 3 + [False] * 3, size // 6)
-    prior = np.tile(place_sigmas**2, size // 6)
-    guess = np.tile(GUESS_SIGMAS**-2.0, size // 6)
-    ratios = np.ones(2)
+    lidars = (size - len(added_m)) // 6
+    kinds = np.repeat([*[0, 1] * lidars, 2], [*[3] * 2 * lidars, len(added_m)])
+    prior = np.concatenate([np.tile(place_sigmas**2, lidars), np.full(len(added_m), _EXACT)])
+    ranges = np.full(len(added_m), RANGE_SIGMA_M**-2.0)
+    guess = np.concatenate([np.tile(GUESS_SIGMAS**-2.0, lidars), ranges])
+    pull = np.concatenate([np.zeros(6 * lidars), -ranges * added_m])
+    ratios = np.ones(3)
     for _ in range(_MOST_STEPS):
-        variance = prior * np.where(is_turn, *ratios)
+        variance = prior * ratios[kinds]
         at_place = np.linalg.inv(informations + np.diag(1.0 / variance))
         gain = at_place @ informations
         known = (informations - informations @ gain).sum(axis=0) + np.diag(guess)
         vector = (vectors - (informations @ (at_place @ vectors[:, :, None]))[:, :, 0]).sum(axis=0)
         joint = np.linalg.inv(known)
-        step = joint @ vector
+        step = joint @ (vector + pull)
         apart = (at_place @ (vectors - informations @ step)[:, :, None])[:, :, 0]
         open_ = np.einsum("pii->pi", at_place + gain @ joint @ gain.transpose(0, 2, 1))
         squares, freedom = (
-            np.array([of[:, is_turn].sum(), of[:, ~is_turn].sum()])
+            np.array([of[:, kinds == 0].sum(), of[:, kinds == 1].sum(), 0.0])
             for of in (apart**2 / prior, 1.0 - open_ / variance)
         )
         before, ratios = ratios, (PLACE_FREEDOM + squares) / (PLACE_FREEDOM + freedom)
         if np.abs(np.log(ratios / before)).max() < _SETTLED:
             break
-    few = np.sqrt(1.0 + 2.0 * freedom / (PLACE_FREEDOM + freedom) ** 2)
-    wider = np.where(is_turn, *few)
+    wider = np.sqrt(1.0 + 2.0 * freedom / (PLACE_FREEDOM + freedom) ** 2)[kinds]
     joint = joint * np.outer(wider, wider)
     return step, (joint + joint.T) / 2, (float(ratios[0]), float(ratios[1]))

@@ -114,7 +114,7 @@ class Drive:
                     (_, T), sums = refine_poses(planes, both, (base, base), first=_FIRST)
                 except CalibrationError:  # too few planes
                     continue
-                if sums.basis().shape[1] < len(_STILL):  # a direction is open
+                if sums.of_poses.basis().shape[1] < len(_STILL):  # a direction is open
                     continue
                 drift[other > number] = T @ invert(T_odometry)
             seen, views = seen.joined(own, T), views + 1

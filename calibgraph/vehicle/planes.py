@@ -27,9 +27,12 @@ _SPREAD = 0.04  # of the same over the squared radius
 _FLAT, _ROUGH_M = 0.01, 0.08  # most variance across a plane over the least along it; most roughness
 
 
-PLANE = np.dtype([("center_m", "f8", 3), ("normal", "f8", 3), ("radius_m", "f8"), ("tilt", "f8")])
-"""A piece of a plane: the mean of its points, a unit vector towards the LiDAR, the radius of the
-neighbourhood, and by how much the normal may err [rad]: roughness over the least extent."""
+PLANE = np.dtype([
+    ("center_m", "f8", 3), ("normal", "f8", 3), ("ray", "f8", 3), ("radius_m", "f8"), ("tilt", "f8")
+])  # fmt: skip
+"""A piece of a plane: the mean of its points, a unit vector towards the LiDAR, one from the LiDAR
+to the mean, the radius of the neighbourhood, and by how much the normal may err [rad]: roughness
+over the least extent."""
 Planes = NDArray[np.void]
 """(n,) of PLANE."""
 
@@ -43,7 +46,15 @@ def moved(planes: Planes, T_base_lidar: Array) -> Planes:
     """The same in another frame, by (4, 4)."""
     found = planes.copy()
     found["center_m"] = move_points(planes["center_m"], T_base_lidar)
-    found["normal"] = planes["normal"] @ T_base_lidar[:3, :3].T
+    for name in ("normal", "ray"):
+        found[name] = planes[name] @ T_base_lidar[:3, :3].T
+    return found
+
+
+def lengthened(planes: Planes, metres: float) -> Planes:
+    """The same as if so much were added to all ranges."""
+    found = planes.copy()
+    found["center_m"] += metres * planes["ray"]
     return found
 
 
@@ -124,7 +135,8 @@ def _fit(
     normals = vectors[:, :, 0]
     normals = normals * np.where((normals * centers).sum(axis=1) > 0, -1.0, 1.0)[:, None]
     tilts = np.sqrt(np.maximum(across, 0.0) / np.maximum(least, np.finfo(float).tiny))
+    rays = centers / np.maximum(np.linalg.norm(centers, axis=1), np.finfo(float).tiny)[:, None]
     planes = np.empty(len(radii), PLANE)
-    for name, values in zip(PLANE.names or (), (centers, normals, radii, tilts), strict=True):
+    for name, values in zip(PLANE.names or (), (centers, normals, rays, radii, tilts), strict=True):
         planes[name] = values
     return planes, is_plane, spreads

@@ -58,6 +58,7 @@ _CLOCK_FRAMES = 0.5
 """Standard deviation of the times of an instant's clouds, in steps between frames, where they are
 not known: of clouds paired by stamps up to 0.5, of one that is a frame late 1."""
 _CLOCK_M = 0.01  # from which a line states it
+_SURE, _LONGER_M = 4.0, 0.005  # sigmas and metres of a difference of ranges that a line states
 _PAIRS, _STEP_PLANES, _STEP_SHARE = 5, 1500, 0.9  # of neighbouring frames; of planes that must fit
 _MOST_HALF_M = 500.0  # within which half of the points are
 _ROUNDS = 2  # while it moves: clouds are brought to one time by the poses found
@@ -156,7 +157,7 @@ def calibrate_rig_lidars(
         progress("finding the vehicle's frame", 0, 1)
     vehicle, unknown = _find_vehicle(rig.vehicle, instants, poses, path)
     twice = _corrected_twice(instants, poses.T_base_lidar)
-    warnings += [*late, *unknown, *twice]
+    warnings += [*late, *unknown, *twice, *_unequal_ranges(poses)]
     for line in warnings:
         _log.warning(line)
     return LidarResult(
@@ -357,6 +358,17 @@ def _corrected_twice(instants: Sequence[Instant], T_base_lidar: Mapping[str, Arr
         seen = spread_out(moving, LOOKED_AT)
         lines.append(corrected_twice(((i.returns[name], turn @ i.twist_per_s) for i in seen), name))
     return [*filter(None, lines)]
+
+
+def _unequal_ranges(poses: LidarPoses) -> list[str]:
+    """A line per LiDAR that measures longer or shorter ranges than the base."""
+    return [
+        f"{name} measures {100 * abs(longer_m):.1f} cm {'longer' if longer_m > 0 else 'shorter'} "
+        f"ranges than {poses.base}: its pose allows for that, and its points "
+        "do not lie on those of other LiDARs"
+        for name, (longer_m, sigma_m) in poses.longer_m.items()
+        if abs(longer_m) > max(_SURE * sigma_m, _LONGER_M)
+    ]
 
 
 def _find_vehicle(

@@ -11,6 +11,9 @@ independent but for what the surface itself does, whose roughness over its exten
 both share. So H = (a b^T + b a^T) / 2 - t^2 (A A^T - a a^T), with A = [c x; I] for every normal,
 and the gradient is (b m . x + a n . x) / 2, of expectation 0 at the true pose. Of a pair at a place
 only the directions count in which H is near what it would be if normals did not err.
+
+What is to be added to the ranges of i moves c along its ray u, so that a and b go on with m . u and
+n . u, and A with u; likewise, with the other sign, for j.
 """
 
 from __future__ import annotations
@@ -31,7 +34,7 @@ CELL_M = 4.0
 _CELL_NUMBERS = np.array([1, 2**12, 2**24])  # of steps along x, y, z: 2,048 either way
 _PLACE_NUMBER = 2**40
 _RELIABLE = 0.8  # of H over H without errors of normals: at places that determine all, over 0.9
-_RIDGE = 1e-9  # of a sum's largest entries
+_RIDGE = 1e-9  # of a sum's largest entry
 _DETERMINED = 0.1  # of the same, over all pairs
 
 
@@ -52,7 +55,9 @@ def residuals_m(matches: Matches) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Sums:
-    """H and g of cells by the steps of all LiDARs but the base, in units of residuals.
+    """H and g of cells by the steps of all LiDARs but the base, and what is added to ranges of all.
+
+    In units of residuals.
 
     Attributes:
         hessian: (r, d, d), positive only in sum.
@@ -64,6 +69,12 @@ class Sums:
     gradient: Array
     metric: Array
 
+    @property
+    def of_poses(self) -> Sums:
+        """The sums with the ranges as they are."""
+        own = slice(6 * ((len(self.metric) + 6) // 7 - 1))
+        return Sums(self.hessian[:, own, own], self.gradient[:, own], self.metric[own, own])
+
     def basis(self) -> Array:
         """(d, q) directions that all pairs together determine."""
         values, vectors = scipy.linalg.eigh(self.hessian.sum(axis=0), _ridged(self.metric))
@@ -72,8 +83,10 @@ class Sums:
 
 def sum_up(matches: Matches, T_base_lidar: Array, scale_m: float) -> Sums:
     """The sums with the weights of a Cauchy loss of a width [m], at poses (k, 4, 4)."""
-    twists, rows, count = step_twists(T_base_lidar), [], len(T_base_lidar)
-    steps, metric = twists.reshape(-1, 6, len(twists)), np.zeros_like(twists)
+    count = len(T_base_lidar)
+    steps = scipy.linalg.block_diag(step_twists(T_base_lidar), np.eye(count))[:, 6:]  # no base
+    twists, ranges = np.split(steps, [6 * count])
+    twists, rows, metric = twists.reshape(count, 6, -1), [], np.zeros((steps.shape[1],) * 2)
     cells = np.floor(matches["plane"]["center_m"] / CELL_M).astype(np.int64) @ _CELL_NUMBERS
     low, high = np.sort([matches["one"], matches["other"]], axis=0)
     pairs = (matches["place"] * count + low) * count + high
@@ -82,16 +95,14 @@ def sum_up(matches: Matches, T_base_lidar: Array, scale_m: float) -> Sums:
     for own in np.split(order, starts[1:]):
         place, one, other = matches["place"][own[0]], low[own[0]], high[own[0]]
         named, hessian, gradient, whole = _of_pair(matches[own], cells[own], one, scale_m)
-        by = steps[one] - steps[other]
+        by = np.vstack([twists[one] - twists[other], ranges[[one, other]]])
         metric += by.T @ whole @ by
         kept = _reliable(hessian.sum(axis=0), whole)
         by = kept @ by
         rows.append((np.full(len(named), place), named, by.T @ hessian @ by, gradient @ by))
     places, cells, hessians, gradients = map(np.concatenate, zip(*rows, strict=True))
     row = np.unique(places * _PLACE_NUMBER + cells, return_inverse=True)[1]
-    hessian, gradient = _added(row.ravel(), hessians), _added(row.ravel(), gradients)
-    free = slice(6, None)  # but the base
-    return Sums(hessian[:, free, free], gradient[:, free], metric[free, free])
+    return Sums(_added(row.ravel(), hessians), _added(row.ravel(), gradients), metric)
 
 
 def step_twists(T_base_lidar: Array) -> Array:
@@ -107,41 +118,40 @@ def step_twists(T_base_lidar: Array) -> Array:
 def _of_pair(
     own: Matches, cells: NDArray[np.int64], one: int, scale_m: float
 ) -> tuple[NDArray[np.int64], Array, Array, Array]:
-    """Numbers of cells (c,), their H (c, 6, 6) and g (c, 6) by the twist of one against the other.
+    """Numbers of cells (c,), their H (c, 8, 8) and g (c, 8).
 
-    And H of all, (6, 6), as if normals did not err. Matches are sorted by their cells (m,).
+    By the twist of one against the other, and by what is added to the ranges of one and of the
+    other. And H of all, (8, 8), as if normals did not err. Matches are sorted by their cells (m,).
     """
     plane, other, (by_other, by_own) = own["plane"], own["of_other"], residuals_m(own)
-    points, weight = plane["center_m"], 1.0 / (1.0 + 0.5 * (by_other**2 + by_own**2) / scale_m**2)
-    a = np.hstack([np.cross(points, other["normal"]), other["normal"]])
-    b = np.hstack([np.cross(other["center_m"], plane["normal"]), plane["normal"]])
-    whole = 0.5 * ((a.T * weight) @ a + (b.T * weight) @ b)
-    shared = 0.5 * (plane["tilt"] ** 2 + other["tilt"] ** 2)[:, None]
-    starts = np.flatnonzero(np.diff(cells, prepend=cells[0] - 1))
-    hessian = _summed(0.5 * weight[:, None] * (b + shared * a), a, starts)
-    at = np.hstack([points, np.ones_like(shared)])
-    hessian += hessian.transpose(0, 2, 1) - _for_all_normals(
-        _summed(weight[:, None] * shared * at, at, starts)
+    weight = 1.0 / (1.0 + 0.5 * (by_other**2 + by_own**2) / scale_m**2)
+    is_one = (own["one"] == one)[:, None]
+    rays = (
+        np.where(is_one, plane["ray"], other["ray"]),
+        -np.where(is_one, other["ray"], plane["ray"]),
     )
+    a, b = (
+        np.hstack([np.cross(at["center_m"], normal), normal,
+                   *((normal * ray).sum(axis=1, keepdims=True) for ray in rays)])
+        for at, normal in ((plane, other["normal"]), (other, plane["normal"]))
+    )  # fmt: skip
+    whole = 0.5 * ((a.T * weight) @ a + (b.T * weight) @ b)
+    every, x = np.zeros((len(own), 3, 8)), plane["center_m"]  # A'
+    every[:, [0, 1, 2], [1, 2, 0]], every[:, [0, 1, 2], [2, 0, 1]] = (
+        x[:, [2, 0, 1]],
+        -x[:, [1, 2, 0]],
+    )
+    every[:, :, 3:6], every[:, :, 6], every[:, :, 7] = np.eye(3), *rays
+    shared = 0.5 * (plane["tilt"] ** 2 + other["tilt"] ** 2)[:, None]
+    each = (b + shared * a)[:, :, None] * a[:, None, :]
+    each -= every.transpose(0, 2, 1) @ (shared[:, :, None] * every)
+    each *= (0.5 * weight)[:, None, None]
+    starts = np.flatnonzero(np.diff(cells, prepend=cells[0] - 1))
+    hessian = np.add.reduceat(each, starts)
+    hessian += hessian.transpose(0, 2, 1)
     gradient = 0.5 * (b * by_other[:, None] + a * by_own[:, None])
-    gradient *= (weight * np.where(own["one"] == one, 1.0, -1.0))[:, None]
+    gradient *= weight[:, None] * np.where(is_one, 1.0, -1.0)
     return cells[starts], hessian, np.add.reduceat(gradient, starts), whole
-
-
-def _summed(a: Array, b: Array, starts: NDArray[np.int64]) -> Array:
-    """(c, k, k) sums of a b^T, of (m, k) rows from each start to the next."""
-    return np.asarray(np.add.reduceat(a[:, :, None] * b[:, None, :], starts))
-
-
-def _for_all_normals(moments: Array) -> Array:
-    """(c, 6, 6) sums of A A^T, from the sums (c, 4, 4) of [x, 1] [x, 1]^T."""
-    out = np.zeros((len(moments), 6, 6))
-    squares, eye = moments[:, :3, :3], np.eye(3)
-    out[:, :3, :3] = squares.trace(axis1=1, axis2=2)[:, None, None] * eye - squares
-    out[:, :3, 3:] = np.cross(eye, moments[:, None, :3, 3])  # matrix @ y = x cross y
-    out[:, 3:, :3] = out[:, :3, 3:].transpose(0, 2, 1)
-    out[:, 3:, 3:] = moments[:, 3:, 3:] * eye
-    return out
 
 
 def _added(rows: NDArray[np.int64], values: Array) -> Array:
@@ -152,13 +162,20 @@ def _added(rows: NDArray[np.int64], values: Array) -> Array:
 
 
 def _reliable(hessian: Array, whole: Array) -> Array:
-    """(6, 6) projection of twists onto directions in which normals hold, along the others."""
-    values, vectors = scipy.linalg.eigh(hessian, _ridged(whole))
-    kept = vectors[:, values > _RELIABLE]
+    """(8, 8) projection onto directions in which normals hold, along the others.
+
+    First of twists alone: of what no normal shows, ranges would tell by the normals' errors.
+    """
+    whole, poses = _ridged(whole), slice(6)
+    values, vectors = scipy.linalg.eigh(hessian[poses, poses], whole[poses, poses])
+    others = vectors[:, values <= _RELIABLE].T @ whole[poses]
+    of = scipy.linalg.null_space(others) if len(others) else np.eye(len(whole))
+    values, vectors = scipy.linalg.eigh(of.T @ hessian @ of, of.T @ whole @ of)
+    kept = of @ vectors[:, values > _RELIABLE]
     return np.asarray(kept @ kept.T @ whole)
 
 
 def _ridged(whole: Array) -> Array:
     """A sum that is positive definite: of exact planes it may be singular."""
-    largest = np.diag(whole).reshape(-1, 3).max(axis=1)  # of turns, of shifts
-    return np.asarray(whole + np.diag(_RIDGE * np.repeat(largest, 3) + np.finfo(float).tiny))
+    ridge = _RIDGE * np.diag(whole).max() + np.finfo(float).tiny
+    return np.asarray(whole + ridge * np.eye(len(whole)))

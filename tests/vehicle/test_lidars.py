@@ -71,6 +71,20 @@ def test_a_start_20_degrees_off_ends_where_a_near_one_does():
     np.testing.assert_allclose(*ends, atol=1e-4)
 
 
+def test_what_a_lidar_adds_to_ranges_widens_the_bar_where_it_looks_one_way():
+    turn = Rotation.from_euler("zyx", [4.0, 3.0, 1.0], degrees=True)
+    ahead = {"top": MOUNTS["top"], "ahead": transform(turn, [2.2, 0.1, -1.0])}
+    clouds = record(201, places=6, mounts=ahead)
+    for number, cloud in enumerate(clouds["ahead"]):
+        seen = cloud[np.abs(np.arctan2(cloud[:, 1], cloud[:, 0])) < np.radians(20.0)]
+        ranges = np.linalg.norm(seen, axis=1, keepdims=True)
+        clouds["ahead"][number] = seen * (1.0 + 0.02 / ranges)
+    found = calibrate_lidars(look(clouds), ahead, base="top")
+    bar = sigmas(found, "ahead")
+    assert bar[3] > 0.01, "as the clouds are, 0.8 cm, 2 cm off"
+    assert (np.abs(errors(found, "ahead", ahead["ahead"])) < 3 * bar).all()
+
+
 def test_a_flat_street_leaves_the_direction_along_it_open():
     clouds = record(3, places=1, street=True)
     guess = {name: displaced(MOUNTS[name], 4, 0.5, 0.05) for name in ("front", "left")}
@@ -128,7 +142,7 @@ def test_errors_over_bars_are_one_where_places_scatter_as_their_prior(lidars, pl
             information = np.linalg.inv(root @ root.T + np.diag((0.05 * sizes) ** 2))
             noise = np.linalg.cholesky(np.linalg.inv(information)) @ rng.normal(size=6 * lidars)
             drawn.append((information, information @ (sizes * rng.normal(size=6 * lidars) + noise)))
-        step, covariance, _ = combine_places(drawn)
+        step, covariance, _ = combine_places(drawn, PLACE_SIGMAS, np.empty(0))
         squares.append(step @ np.linalg.solve(covariance, step) / (6 * lidars))
     # the mean of 1800 squares of normal numbers has a deviation of sqrt(2 / 1800) = 0.03; sizes
     # that are common to a recording double it

@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -104,6 +105,20 @@ def test_a_lidar_that_does_not_fit_its_guess_is_found_without_and_named(tmp_path
     assert "it does not fit its guess, but turned by 0 deg and moved by 1" in " ".join(
         found.verdicts["left"].reasons
     )
+
+
+def test_a_lidar_that_measures_too_long_is_placed_where_it_is_and_named(tmp_path: Path):
+    folder = write_vehicle(tmp_path, without="left")
+    for path in (folder / "lidars" / "front").iterdir():
+        cloud = np.load(path)
+        ranges = np.linalg.norm(cloud[:, :3], axis=1, keepdims=True)
+        cloud[:, :3] *= 1.0 + 0.02 / ranges
+        np.save(path, cloud)
+    result = calibgraph.calibrate(folder)
+    off = result.T_base_lidar["front"][:3, 3] - MOUNTS["front"][:3, 3]
+    assert np.linalg.norm(off) < 0.004, "2 cm off by the clouds as they are"
+    line = next(each for each in result.warnings if each.startswith("front measures"))
+    assert re.match(r"front measures (1\.[89]|2\.[0-2]) cm longer ranges than top:", line)
 
 
 def test_clouds_in_millimetres_are_refused(tmp_path: Path):
