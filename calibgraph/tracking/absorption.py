@@ -86,28 +86,25 @@ def sums_of(state: State, gated: Mapping[int, Gated]) -> Sums:
         gated: by camera; linearized at its poses.
     """
     parts, cameras = [], list[int]()
-    for camera, one in gated.items():
-        edges = np.concatenate([[0], one.counts.cumsum().astype(np.int64)])
-        block = one.raw.with_scale(state.scales[camera]).select(one.inliers)
-        parts.append(block.summarize(one.poses, to_runs(edges)))
-        cameras += [camera] * one.raw.frames
+    for camera, own in gated.items():
+        edges = np.concatenate([[0], own.counts.cumsum().astype(np.int64)])
+        block = own.inside.with_scale(state.scales[camera])
+        parts.append(block.summarize(own.poses, to_runs(edges)))
+        cameras += [camera] * own.raw.frames
     here, to = BlockSums.join(parts), state.references[cameras]
-    poses = np.concatenate([one.poses for one in gated.values()])
+    poses = np.concatenate([own.poses for own in gated.values()])
     root = np.linalg.cholesky(here.hessian + WEAK)
     hessian = root @ state.curvature[cameras] @ root.swapaxes(1, 2)
     gradient = here.gradient
     if not np.array_equal(poses, to):
         steps = logarithms(poses @ invert(to))
         gradient = gradient + (hessian @ steps[..., None])[..., 0]
-    return Sums.zeros(len(cameras)).change(
-        hessian=hessian,
-        gradient=gradient,
-        reweighted=here.hessian,
-        score=gradient,
-        scatter=gradient[:, :, None] * gradient[:, None, :],
-        frames=np.ones(len(cameras)),
-        matches=np.concatenate([one.counts for one in gated.values()]),
+    scatter, counts = (
+        gradient[:, :, None] * gradient[:, None, :],
+        [g.counts for g in gated.values()],
     )
+    one, matches = np.ones(len(cameras)), np.concatenate(counts)
+    return Sums.of(hessian, here.hessian, scatter, gradient, gradient, one, matches)
 
 
 def add_to_totals(state: State, frames: Sums) -> None:
@@ -294,7 +291,7 @@ def _start_camera(state: State, camera: int, T_camera_lidar: Array) -> None:
         started=True, waiting=(), references=T_camera_lidar,
         scales=scale, share=gated.usual_share, curvature=curvature,
     )  # fmt: skip
-    _consider_lens(state, camera, raw.select(gated.inliers))
+    _consider_lens(state, camera, gated.inside)
     absorb_again(state, camera, raw, T_camera_lidar)
 
 
@@ -356,5 +353,5 @@ def absorb_again(state: State, camera: int, raw: CameraBlock | None, T_camera_li
     own, bends = state.matches_of(camera), state.bends[camera].copy()
     bends[:54] = 0.0  # the matches follow the distortion in another way
     if own is not None:
-        bends[:54] = _bends_of(state, camera, own.raw.select(own.inliers))[:54]
+        bends[:54] = _bends_of(state, camera, own.inside)[:54]
     state.put(camera, bends=bends)

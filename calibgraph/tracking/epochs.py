@@ -110,14 +110,15 @@ def _regate(state: State, camera: int, places: Numbers, *, is_steady: bool) -> N
     state.put(camera, scales=scale, share=gated.usual_share)
     if (shown := gated.select(newest) if state.walk[camera] else gated).enough.any():
         state.put(camera, curvature=shown.curvature(reference, scale))
-    within = np.where(np.repeat(gated.enough, raw.frame_counts), gated.inliers, own.inliers)
-    gated = Gated(raw, within, poses)
-    state.put(camera, matches=(gated,))
+    if not gated.enough.all():
+        within = np.where(np.repeat(gated.enough, raw.frame_counts), gated.inliers, own.inliers)
+        gated = Gated(raw, within, poses)
+    state.put(camera, matches=(Gated(raw, gated.inliers, poses),))
     if not state.walk[camera]:
         steps = np.zeros((len(rows), 6))
         if state.config.preset == "auto":  # Eq. 5 knows no places
             steps = np.concatenate([state.steps[:, camera], steps[:1]])[places[rows]]
-        gated = Gated(raw, within, retract_all(reference[None].repeat(len(rows), axis=0), steps))
+        gated = gated.moved_to(retract_all(reference[None].repeat(len(rows), axis=0), steps))
     state.sums = state.sums.replace_at((rows, camera), sums_of(state, {camera: gated}))
 
 
