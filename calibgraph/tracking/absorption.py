@@ -28,7 +28,6 @@ from calibgraph.tracking.sums import Sums
 from factors import BlockSums, to_runs
 from factors.pose_kernel import logarithms
 
-_ABSORBED = [COUNTS.index(name) for name in ("given", "used", "absorbed")]
 _LAST_FRAMES = 20  # of which it is kept whether they agree with the estimate
 _UNUSUAL = 25.0  # squared sigmas of a six-vector
 _TOTAL_KEPT = 1 - 1 / 2000  # of the total scatter, from frame to frame
@@ -64,7 +63,6 @@ def absorb(state: State, gated: Mapping[int, Gated]) -> None:
     numbers = np.concatenate([one.raw.frame_numbers for one in kept.values()])
     rows = np.searchsorted(state.numbers, numbers)
     state.sums = state.sums.replace_at((rows, cameras), sums_of(state, kept))
-    state.counts = state.counts.copy()
     for camera, one in kept.items():
         agreed = ((number, True) for number in one.raw.frame_numbers.tolist())
         state.put(
@@ -72,7 +70,8 @@ def absorb(state: State, gated: Mapping[int, Gated]) -> None:
             matches=(*state.matches[camera], one),
             agreements=(*state.agreements[camera], *agreed)[-_LAST_FRAMES:],
         )
-        state.counts[camera, _ABSORBED] += [len(one.inliers), int(one.counts.sum()), one.raw.frames]
+        given, used, absorbed = len(one.inliers), int(one.counts.sum()), one.raw.frames
+        state.count(camera, given=given, used=used, absorbed=absorbed)
 
 
 def sums_of(state: State, gated: Mapping[int, Gated]) -> Sums:

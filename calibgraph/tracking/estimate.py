@@ -44,6 +44,7 @@ from calibgraph.tracking.window import Window
 _EXACT = 1e-4  # rad and m: what is stated of places to be smaller counts as nothing
 _SETTLED = 50.0  # frames of a camera: an epoch more hardly changes their scatter
 _ROUNDS = 2  # of estimates of the variance ratios, a fit after each
+_ALIKE = np.eye(6)  # of what frames of a place share by the matcher's statement
 _OPEN_WEIGHINGS, _MOST_WEIGHINGS, _SAME_WEIGHT = 2, 20, 1e-2
 
 
@@ -127,7 +128,7 @@ class Terms:
         names, weighted = tuple(sums.names[row] for row in rows), own.reweighted + WEAK
         known = state.settled_rows(names)
         stated = findings.place_variance * spread.efficiency
-        excess = spread.excess + (stated * frames / places)[..., None, None] * np.eye(6)
+        excess = spread.excess + (stated * frames / places)[..., None, None] * _ALIKE
         seen, inverse = frames > 0, np.linalg.inv(np.linalg.cholesky(weighted))
         alike = np.where(seen, places, np.inf).min(axis=1)
         return Terms(
@@ -292,6 +293,8 @@ class EpochGraph:
         rig, T = state.rig.model_copy(update={"relative_poses": pairs}), self.rig.T_camera_lidar
         self.pose_graph = objective_graph(rig, {}, T, state.config, terms="full")
         self.prior = pose_equations(self.pose_graph, state.names, T)
+        travel = state.travel.reshape(-1, state.travel.shape[2])
+        self._considered = block_diagonal(state.lens_errors) + travel @ travel.T
         self.window = self.new_window(state)
         self._held: dict[frozenset[str], tuple[Array, Array]] = {}
 
@@ -334,8 +337,7 @@ class EpochGraph:
         T, covariance = self.window.reported(state.config.of)
         if state.config.preset != "auto":
             T = retract_all(state.references, self.equation_5(sums))
-        travel = state.travel.reshape(len(covariance), -1)
-        covariance = covariance + block_diagonal(state.lens_errors) + travel @ travel.T
+        covariance = covariance + self._considered
         few = np.repeat(sums.frames < ENOUGH_FRAMES, 6)
         covariance[few], covariance[:, few] = np.nan, np.nan
         return Estimate(T, covariance, sums, self._conflicts(state, sums), self.window)
