@@ -223,7 +223,7 @@ def count_absent(state: State, used: Collection[int], frame: StreamFrame) -> lis
         frame: this one.
     """
     events, limit, number = [], state.config.tracking.blind_frames, frame.frame
-    absent = np.where(state.started, state.absent + 1, state.absent)
+    absent = state.absent + state.started
     absent[[*used]] = 0
     for camera in np.flatnonzero(state.started & (absent != state.absent)).tolist():
         name = state.names[camera]

@@ -234,6 +234,7 @@ def _estimate(update: Update, name: str) -> str:
     """What holds for all frames that were taken in at once."""
     covariance, verdict = update.covariance[name], update.verdicts[name]
     sigmas = None if covariance is None else np.sqrt(np.diag(covariance))
+    reasons = list(verdict.reasons)
     return _text(
         {
             "T_camera_lidar": update.T_camera_lidar[name].tolist(),
@@ -242,8 +243,8 @@ def _estimate(update: Update, name: str) -> str:
             "translation_sigma_cm": None if sigmas is None else (100 * sigmas[3:]).tolist(),
             "verdict": verdict.status,
             "cannot_tell": verdict.cannot_tell,
-            "reasons": list(verdict.reasons),
-            "actions": list(summarize({name: verdict}).actions),
+            "reasons": reasons,
+            "actions": list(summarize({name: verdict}).actions) if reasons else [],
         }
     )
 

@@ -337,9 +337,8 @@ class EpochGraph:
         T, covariance = self.window.reported(state.config.of)
         if state.config.preset != "auto":
             T = retract_all(state.references, self.equation_5(sums))
-        covariance = covariance + self._considered
-        few = np.repeat(sums.frames < ENOUGH_FRAMES, 6)
-        covariance[few], covariance[:, few] = np.nan, np.nan
+        unknown = np.where(sums.frames < ENOUGH_FRAMES, np.nan, 0.0).repeat(6)
+        covariance = covariance + self._considered + np.add.outer(unknown, unknown)
         return Estimate(T, covariance, sums, self._conflicts(state, sums), self.window)
 
     def open_spread(self, state: State, every: PlaceSums) -> Spread:
