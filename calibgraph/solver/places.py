@@ -53,7 +53,6 @@ from factors.pose_kernel import logarithms
 TOLERANCE = 1e-6
 """Relative change of the cost at which it stops: some 1e-3 of the smallest standard deviations."""
 
-_ONE = np.eye(6)
 _FREE = 1e3  # rad and m: a standard deviation that no correspondences have
 _SHARES = 0.5 ** np.arange(12)
 """Of a step: the first that descends; mostly the whole step."""
@@ -358,7 +357,7 @@ def soften(
     pulled = gradient if error is None else gradient - _times(hessian[..., :6], error)
     whole = np.concatenate([hessian, pulled[..., None]], axis=-1)
     rows = whole[..., :6, :]
-    left = _inverses(_ONE + rows[..., :6] @ covariance)
+    left = _inverses(np.eye(6) + rows[..., :6] @ covariance)
     free = covariance @ left
     free = (free + _turned(free)) / 2
     softened = whole - _turned(hessian[..., :6, :]) @ (free @ rows)

@@ -98,12 +98,10 @@ def sums_of(state: State, gated: Mapping[int, Gated]) -> Sums:
     if not np.array_equal(poses, to):
         steps = logarithms(poses @ invert(to))
         gradient = gradient + (hessian @ steps[..., None])[..., 0]
-    scatter, counts = (
-        gradient[:, :, None] * gradient[:, None, :],
-        [g.counts for g in gated.values()],
-    )
-    one, matches = np.ones(len(cameras)), np.concatenate(counts)
-    return Sums.of(hessian, here.hessian, scatter, gradient, gradient, one, matches)
+    scatter, frames = gradient[:, :, None] * gradient[:, None, :], len(cameras)
+    matches = np.concatenate([own.counts for own in gated.values()])
+    values = hessian, here.hessian, scatter, gradient, gradient, np.ones(frames), matches
+    return Sums(np.concatenate([each.reshape(frames, -1) for each in values], axis=1))
 
 
 def add_to_totals(state: State, frames: Sums) -> None:

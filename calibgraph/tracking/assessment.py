@@ -212,11 +212,11 @@ def json_lines(updates: Sequence[Update]) -> list[str]:
         if update.verdicts is not held:  # frames taken in at once have the same
             held = update.verdicts
             estimates = {name: _estimate(update, name) for name in update.T_camera_lidar}
-        own = {
-            name: _text({"used": update.used.get(name, 0), "left_out": name in update.left_out})
-            for name in estimates
-        }
-        cameras = (f"{_text(n)}: {text[:-1]}, {own[n][1:]}" for n, text in estimates.items())
+        cameras = (
+            f'{_text(name)}: {text[:-1]}, "used": {update.used.get(name, 0)}, '
+            f'"left_out": {_text(name in update.left_out)}}}'
+            for name, text in estimates.items()
+        )
         head = _text({"frame": update.frame, "stamp_ns": update.stamp_ns})
         events = _text([*map(_event, update.events)])
         lines.append(f'{head[:-1]}, "cameras": {{{", ".join(cameras)}}}, "events": {events}}}')
@@ -224,10 +224,7 @@ def json_lines(updates: Sequence[Update]) -> list[str]:
 
 
 def _text(content: object) -> str:
-    try:
-        return json.dumps(content, allow_nan=False)
-    except ValueError:  # of numbers that JSON does not have
-        return json.dumps(finite(content), allow_nan=False)
+    return json.dumps(finite(content), allow_nan=False)
 
 
 def _estimate(update: Update, name: str) -> str:
@@ -235,18 +232,17 @@ def _estimate(update: Update, name: str) -> str:
     covariance, verdict = update.covariance[name], update.verdicts[name]
     sigmas = None if covariance is None else np.sqrt(np.diag(covariance))
     reasons = list(verdict.reasons)
-    return _text(
-        {
-            "T_camera_lidar": update.T_camera_lidar[name].tolist(),
-            "covariance": None if covariance is None else covariance.tolist(),
-            "rotation_sigma_deg": None if sigmas is None else np.degrees(sigmas[:3]).tolist(),
-            "translation_sigma_cm": None if sigmas is None else (100 * sigmas[3:]).tolist(),
-            "verdict": verdict.status,
-            "cannot_tell": verdict.cannot_tell,
-            "reasons": reasons,
-            "actions": list(summarize({name: verdict}).actions) if reasons else [],
-        }
-    )
+    content = {
+        "T_camera_lidar": update.T_camera_lidar[name].tolist(),
+        "covariance": None if covariance is None else covariance.tolist(),
+        "rotation_sigma_deg": None if sigmas is None else np.degrees(sigmas[:3]).tolist(),
+        "translation_sigma_cm": None if sigmas is None else (100 * sigmas[3:]).tolist(),
+        "verdict": verdict.status,
+        "cannot_tell": verdict.cannot_tell,
+        "reasons": reasons,
+        "actions": list(summarize({name: verdict}).actions) if reasons else [],
+    }
+    return _text(content)
 
 
 def _event(event: Event) -> dict[str, Any]:

@@ -44,7 +44,6 @@ from calibgraph.tracking.window import Window
 _EXACT = 1e-4  # rad and m: what is stated of places to be smaller counts as nothing
 _SETTLED = 50.0  # frames of a camera: an epoch more hardly changes their scatter
 _ROUNDS = 2  # of estimates of the variance ratios, a fit after each
-_ALIKE = np.eye(6)  # of what frames of a place share by the matcher's statement
 _OPEN_WEIGHINGS, _MOST_WEIGHINGS, _SAME_WEIGHT = 2, 20, 1e-2
 
 
@@ -128,7 +127,7 @@ class Terms:
         names, weighted = tuple(sums.names[row] for row in rows), own.reweighted + WEAK
         known = state.settled_rows(names)
         stated = findings.place_variance * spread.efficiency
-        excess = spread.excess + (stated * frames / places)[..., None, None] * _ALIKE
+        excess = spread.excess + (stated * frames / places)[..., None, None] * np.eye(6)
         seen, inverse = frames > 0, np.linalg.inv(np.linalg.cholesky(weighted))
         alike = np.where(seen, places, np.inf).min(axis=1)
         return Terms(
@@ -154,16 +153,10 @@ class Terms:
         hessian, gradient, of_cloud = soften(hessian, gradient, cloud)
         return Eliminated(hessian.sum(axis=0), gradient.sum(axis=0), of_cloud, cameras, by)
 
-    @cached_property
-    def _inverses(self) -> tuple[Array, Array]:
-        return np.asarray(np.linalg.inv(self.cloud)), np.asarray(np.linalg.inv(self.at_place))
-
     def squared(self, u: Array, v: Array) -> Array:
         """(P, 1 + n) squared sigmas of such displacements, in a loss that is not robust."""
-        of_u, of_v = (
-            (one * (inverse @ one[..., None])[..., 0]).sum(axis=-1)
-            for one, inverse in zip((u, v), self._inverses, strict=True)
-        )
+        of_u = (u * np.linalg.solve(self.cloud, u[..., None])[..., 0]).sum(axis=-1)
+        of_v = (v * np.linalg.solve(self.at_place, v[..., None])[..., 0]).sum(axis=-1)
         return np.column_stack([of_u, np.where(self.seen, of_v, 0.0)])
 
     def weigh(self, squared: Array) -> Array:

@@ -83,12 +83,6 @@ class Gated:
         least = np.maximum(_AGREEMENT * usual_share * self.raw.frame_counts, MIN_MATCHES)
         return bool((self.counts >= least).all())
 
-    def moved_to(self, poses: Array) -> Gated:
-        """The same matches within the gate, with other (f, 4, 4) poses."""
-        other = replace(self, poses=poses)
-        other.__dict__.update(inside=self.inside, counts=self.counts)
-        return other
-
     def select(self, frames: Mask) -> Gated:
         """Some of the frames."""
         if frames.all():

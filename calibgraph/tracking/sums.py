@@ -52,11 +52,6 @@ class Sums:
     packed: Array
 
     @staticmethod
-    def of(*parts: Array) -> Sums:
-        """From the properties of (f,) frames, in their order here."""
-        return Sums(np.concatenate([part.reshape(len(part), -1) for part in parts], axis=1))
-
-    @staticmethod
     def zeros(*shape: int) -> Sums:
         """Over no frames, with these leading axes."""
         return Sums(np.zeros((*shape, _SIZE)))
