@@ -127,11 +127,10 @@ def calibrated(
 @pytest.mark.parametrize(
     "case",
     [
-        "one camera",
         "excluded camera",
         *(
             pytest.param(each, marks=pytest.mark.slow)
-            for each in ("no overlap", "overlap", "relative pose", "no time")
+            for each in ("one camera", "no overlap", "overlap", "relative pose", "no time")
         ),
     ],
 )

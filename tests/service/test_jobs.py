@@ -8,7 +8,14 @@ from typing import Any
 import pytest
 from starlette.testclient import TestClient
 
-from calibgraph import load_rig, solve
+from calibgraph import (
+    Rig,
+    calibrate,
+    load_dataset,
+    load_rig,
+    simulate_correspondences,
+    solve,
+)
 from calibgraph.service.app import create_app
 from calibgraph.service.requests import Settings
 from tests.conftest import SAMPLE, CommandRun, require_poses
@@ -160,16 +167,19 @@ def test_a_check_has_its_page(working: TestClient, calibrated_sample: CommandRun
     assert (result["same_recording"], result["deployed_verdict"]) == (True, "PASS")
 
 
-def test_a_recording_is_calibrated_as_by_the_command(
-    working: TestClient, calibrated_sample: CommandRun
-) -> None:
-    table = (calibrated_sample.folder.parent / "table.parquet").read_bytes()
-    files = {"recording": zip_of_the_sample(), "correspondences": table}
+def test_a_recording_is_calibrated_as_by_the_library(working: TestClient, tmp_path: Path) -> None:
+    """One camera, in two frames."""
+    rig, table = tmp_path / "rig.yaml", tmp_path / "table.parquet"
+    left, truth = (load_rig(path).cameras["left"] for path in (SAMPLE, SAMPLE / "reference.yaml"))
+    Rig(cameras={"left": left}).save(rig)
+    simulate_correspondences(Rig(cameras={"left": truth}), frames=2).save(table)
+    frames = load_dataset(SAMPLE, load_rig(rig), frames="0:2")
+    expected = calibrate(frames, matcher=table).T_camera_lidar
+    files = {
+        "rig": rig.read_bytes(),
+        "recording": zip_of_the_sample("rig", "000000", "000001"),
+        "correspondences": table.read_bytes(),
+    }
     at = working.post("/v1/jobs/calibrate", files=files).headers["location"]
-    for _ in range(5):
-        job = working.get(at, params={"wait_s": 60}).json()
-        if job["finished"]:
-            break
-    result = working.get(f"{at}/result").json()
-    expected = load_rig(calibrated_sample.folder / "calibration.yaml")
-    require_poses(poses_of(result), expected.T_camera_lidar, atol=1e-9)
+    assert working.get(at, params={"wait_s": 60}).json()["finished"]
+    require_poses(poses_of(working.get(f"{at}/result").json()), expected, atol=1e-9)

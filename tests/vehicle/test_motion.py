@@ -33,7 +33,7 @@ def sweep(boxes: Array, lidar: str, speed_m_s: float, rng: np.random.Generator, 
     for number, azimuths_deg in enumerate(np.split(ALL_AROUND_DEG, SLICES)):
         seconds = LATE_S[lidar] + SCAN_S * (number + 0.5) / SLICES
         T_road_lidar = pose_at(from_s + seconds, speed_m_s) @ MOUNTS[lidar]
-        points = scan(boxes, T_road_lidar, rng, azimuths_deg=azimuths_deg)
+        points = scan(boxes, T_road_lidar, rng, beams=12, azimuths_deg=azimuths_deg)
         parts += [(*point, round(1e9 * seconds)) for point in points.tolist()]
     return np.array(parts, dtype=[("x", "f4"), ("y", "f4"), ("z", "f4"), ("t", "u4")])
 
@@ -208,7 +208,7 @@ def test_lidars_that_share_nothing_are_joined_by_motion(tmp_path, caplog):
 
 
 def test_lidars_that_share_nothing_are_refused_where_the_motion_is_unknown(tmp_path):
-    folder = write_street(tmp_path, 4.5)
+    folder = write_street(tmp_path, 3.0)
     message = r"'behind' shares too little with ahead: .*%.* or drive 150 m past walls, with times"
     with pytest.raises(CalibrationError, match=message):
         calibgraph.calibrate(folder)
