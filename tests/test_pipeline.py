@@ -157,6 +157,8 @@ def test_places_of_the_table_count_in_the_solve(guess: Rig, truth: Rig) -> None:
         assert np.trace(b[:3, :3]) < 0.9 * np.trace(a[:3, :3])
 
 
+@pytest.mark.ci
+@pytest.mark.slow
 def test_the_commands_solve_what_calibrate_saved(
     guess: Rig, truth: Rig, recordings: Sequence[Path], tmp_path: Path, call: Call
 ) -> None:

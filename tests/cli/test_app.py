@@ -107,6 +107,8 @@ for line in sys.argv[1:]:
 """
 
 
+@pytest.mark.ci
+@pytest.mark.slow
 def test_commands_need_no_package_of_an_extra(tmp_path: Path) -> None:
     """Those that only extras name cannot be imported."""
     lines = (

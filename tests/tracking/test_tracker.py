@@ -358,9 +358,9 @@ def degenerate(number: int, good: Correspondences, rng: np.random.Generator) -> 
     [
         ("one", 1.0, 34),
         pytest.param("fisheye", 0.4, 50, marks=pytest.mark.slow),
-        ("fisheye", 1.0, 34),
+        pytest.param("fisheye", 1.0, 34, marks=pytest.mark.slow),
         ("mirror", 0.4, 34),
-        ("tied", 0.4, 50),
+        pytest.param("tied", 0.4, 50, marks=pytest.mark.slow),
         ("tied", 1.0, 34),
     ],
 )

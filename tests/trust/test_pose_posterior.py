@@ -61,6 +61,8 @@ def random_covariance(size: int, seed: int) -> Array:
     return np.asarray(root @ root.T)
 
 
+@pytest.mark.ci
+@pytest.mark.slow
 def test_images_with_structure_tell_the_pose_to_a_tenth_of_a_degree(
     posteriors: dict[str, PosePosterior],
 ) -> None:
@@ -70,6 +72,8 @@ def test_images_with_structure_tell_the_pose_to_a_tenth_of_a_degree(
     assert 100 * sigmas[3:].max() < 4  # with the share that ends elsewhere, 0.1 %
 
 
+@pytest.mark.ci
+@pytest.mark.slow
 def test_about_a_wrong_result_it_reaches_as_far_as_the_truth_and_favours_it(
     posteriors: dict[str, PosePosterior],
 ) -> None:

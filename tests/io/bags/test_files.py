@@ -358,6 +358,8 @@ for path in sys.argv[1:]:
 """
 
 
+@pytest.mark.ci
+@pytest.mark.slow
 def test_a_bomb_is_one_line_in_little_time_and_memory(tmp_path: Path) -> None:
     paths = []
     for name, (make, _) in BOMBS.items():
