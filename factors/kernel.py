@@ -7,8 +7,8 @@ negative, hence those without a sign, an entry that a row may overlap, hence wha
 before a loop, and Python's exception on a division by zero, hence ``error_model="numpy"``.
 
 There is one kernel per kind of lens, whose number is a constant in it: the branches of other lenses
-are not compiled. Of an undistorted pinhole without whitening matrices, sums by the pose are made
-from x/z, y/z and 1/z, in a fifth of the time.
+are not compiled. Sums by the pose alone are made of the derivatives by the point, in half the time
+of rows of derivatives by the pose.
 
 The loss is Cauchy's, rho(s) = k log(1 + s / k) with the square k of a scale, and psi = rho' is
 1 / (1 + s / k); of an infinite scale it is s. The second derivative of rho(s) / 2 is
@@ -27,7 +27,6 @@ from factors.arrays import contiguous, read_only
 from factors.compiled import compiled
 from factors.lens_kernels import (
     FISHEYE,
-    LIMIT,
     MIN_DEPTH_M,
     OMNIDIRECTIONAL,
     PINHOLE,
@@ -50,9 +49,6 @@ TILE = 256
 """Rows of a tile: the residual, the derivatives of u and v by the point, the point in the camera
 frame, and the loss' weight psi."""
 ROWS = 12
-
-(A, B, W) = (X, Y, Z)
-"""Of an undistorted pinhole, in place of the point: x/z, y/z and 1/z."""
 
 MATRICES = 3
 """Rows of the whitening if it is matrices; 1 if it is numbers, 0 if there is none."""
@@ -140,8 +136,7 @@ def _kernel(kind: int) -> Any:
         size, fits = 7 + len(free), tolerance >= 0.0
         rows, bends, tile = np.empty((size, WIDTH)), np.empty((size, TILE)), np.empty((ROWS, TILE))
         tried, sums, work = np.empty((2, 4, 4)), np.empty((2, size + 1, size)), np.empty((7, 6))
-        has_rays = kind == PINHOLE and math.isinf(lens[LIMIT]) and len(whitening) < MATRICES
-        has_rays = has_rays and (wanted < COLUMNS or (COST <= wanted <= PRODUCTS and size == 7))  # noqa: PLR2004
+        by_pose = COST <= wanted <= PRODUCTS and size == 7 and len(step) == 0  # noqa: PLR2004
         for run in range(len(runs)):
             best, new = np.int64(0), np.int64(0)  # for a literal, parts would be compiled twice
             damping, is_done = DAMPING, False
@@ -155,25 +150,34 @@ def _kernel(kind: int) -> Any:
                         found[i, k] = 0.0
                 for start in range(runs[run, 0], runs[run, 1], TILE):
                     n = min(TILE, runs[run, 1] - start)
-                    as_rays = has_rays and project_rays(lens, T, columns, start, n, tile)
-                    inside = as_rays
-                    if kind == PINHOLE and not as_rays:
+                    inside = False
+                    if kind == PINHOLE:
                         inside = project_pinhole(lens, T, columns, start, n, tile)
-                    if kind != PINHOLE:
+                        if wanted >= COLUMNS and wanted != COST:
+                            differentiate_pinhole(lens, inside, n, tile)
+                    else:
                         project(kind, lens, T, columns, start, n, tile)
                     if wanted < COLUMNS:
-                        for k in range(n):
-                            flags[start + k] = inside or is_projectable(
+                        for k in range(n if inside else 0):
+                            flags[np.uint64(start + k)] = True
+                        for k in range(0 if inside else n):
+                            flags[start + k] = is_projectable(
                                 kind, lens, tile[X, k], tile[Y, k], tile[Z, k]
                             )
-                            if wanted == RESIDUALS:
-                                out[0, 0, start + k, 0] = tile[RU, k]
-                                out[0, 0, start + k, 1] = tile[RV, k]
+                        for k in range(n if wanted == RESIDUALS else 0):
+                            out[0, 0, start + k, 0] = tile[RU, k]
+                            out[0, 0, start + k, 1] = tile[RV, k]
                         if wanted == NORMS:
                             fill_norms(whitening, start, n, tile, flags, out[0, 0])
                         continue
-                    if as_rays:
-                        add_rays(lens, whitening, width, start, n, wanted, tile, found)
+                    if by_pose:
+                        if len(whitening):
+                            whiten(whitening, start, n, tile[RU], tile[RV])
+                            for k in range(3 if wanted != COST else 0):
+                                whiten(whitening, start, n, tile[UX + k], tile[VX + k])
+                        found[7, 0] += weigh(width, n, tile[RU], tile[RV], tile[PSI])
+                        if wanted != COST:
+                            add_by_pose(n, tile, found)
                         continue
                     fill_rows(n, tile, rows)
                     if len(free):
@@ -181,7 +185,8 @@ def _kernel(kind: int) -> Any:
                             kind, lens, T, columns, moves, start, n, free, units, tile, rows
                         )
                     if len(whitening):
-                        whiten(whitening, start, n, rows)
+                        for k in range(size):
+                            whiten(whitening, start, n, rows[k], rows[k, n:])
                     if wanted == COLUMNS:
                         for k in range(size):
                             for i in range(n):
@@ -346,18 +351,16 @@ def add_products(length, rows, out):  # type: ignore[no-untyped-def]
 
 
 @compiled(part=True, fastmath=FAST)
-def whiten(whitening, start, n, rows):  # type: ignore[no-untyped-def]
-    """Multiply rows of u and v by the whitening matrices, or by numbers."""
-    for k in range(len(rows)):
-        row = rows[k]
-        for i in range(n):
-            at, behind = np.uint64(start + i), np.uint64(n + i)
-            if len(whitening) == MATRICES:
-                row[i] = whitening[0, at] * row[i] + whitening[1, at] * row[behind]
-                row[behind] *= whitening[2, at]
-            else:
-                row[i] *= whitening[0, at]
-                row[behind] *= whitening[0, at]
+def whiten(whitening, start, n, u, v):  # type: ignore[no-untyped-def]
+    """Multiply a row of u and one of v by the whitening matrices, or by numbers."""
+    for i in range(n):
+        at = np.uint64(start + i)
+        if len(whitening) == MATRICES:
+            u[i] = whitening[0, at] * u[i] + whitening[1, at] * v[i]
+            v[i] *= whitening[2, at]
+        else:
+            u[i] *= whitening[0, at]
+            v[i] *= whitening[0, at]
 
 
 @compiled(part=True, fastmath=FAST)
@@ -409,31 +412,6 @@ def fill_norms(whitening, start, n, tile, seen, norms):  # type: ignore[no-untyp
                 norms[row, i] = math.inf
 
 
-@compiled(part=True, fastmath=FAST)
-def project_rays(lens, T, columns, start, n, tile):  # type: ignore[no-untyped-def]
-    """Residuals of an undistorted pinhole, x/z, y/z and 1/z.
-
-    False, if a point is too near for these to hold.
-    """
-    ru, rv, ra, rb, rw = tile[RU], tile[RV], tile[A], tile[B], tile[W]
-    fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
-    t00, t01, t02, t03 = T[0, 0], T[0, 1], T[0, 2], T[0, 3]
-    t10, t11, t12, t13 = T[1, 0], T[1, 1], T[1, 2], T[1, 3]
-    t20, t21, t22, t23 = T[2, 0], T[2, 1], T[2, 2], T[2, 3]
-    too_near = 0.0
-    for i in range(n):
-        at = np.uint64(start + i)
-        px, py, pz = columns[0, at], columns[1, at], columns[2, at]
-        z = t20 * px + t21 * py + t22 * pz + t23
-        w = 1.0 / z
-        a = (t00 * px + t01 * py + t02 * pz + t03) * w
-        b = (t10 * px + t11 * py + t12 * pz + t13) * w
-        ru[i], rv[i] = fx * a + (cx - columns[3, at]), fy * b + (cy - columns[4, at])
-        ra[i], rb[i], rw[i] = a, b, w
-        too_near += 0.0 if z > MIN_DEPTH_M else 1.0
-    return too_near == 0.0
-
-
 @compiled(inline="always")
 def project(kind, lens, T, columns, start, n, tile):  # type: ignore[no-untyped-def]
     """Residuals, their derivatives by the point, and the point in the camera frame."""
@@ -453,13 +431,11 @@ def project(kind, lens, T, columns, start, n, tile):  # type: ignore[no-untyped-
 
 @compiled(part=True, fastmath=FAST)
 def project_pinhole(lens, T, columns, start, n, tile):  # type: ignore[no-untyped-def]
-    """``project`` for a pinhole: without branches, if no point lies outside the lens' domain.
+    """Residuals of a pinhole, and the points: without branches, if all are in the lens' domain.
 
-    False, if a point does.
+    False, if a point is not.
     """
-    ru, rv = tile[RU], tile[RV]
-    ux, uy, uz, vx, vy, vz = tile[UX], tile[UY], tile[UZ], tile[VX], tile[VY], tile[VZ]
-    rx, ry, rz = tile[X], tile[Y], tile[Z]
+    ru, rv, rx, ry, rz = tile[RU], tile[RV], tile[X], tile[Y], tile[Z]
     fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6, limit = (
         lens[0], lens[1], lens[2], lens[3], lens[4], lens[5], lens[6], lens[7], lens[8], lens[9],
         lens[10], lens[11], lens[12],
@@ -478,17 +454,35 @@ def project_pinhole(lens, T, columns, start, n, tile):  # type: ignore[no-untype
         a, b = x * w, y * w
         r2 = a * a + b * b
         outside += 0.0 if z > MIN_DEPTH_M and r2 <= limit * limit else 1.0
-        p, q, by_a, cross, _, by_b = distort(a, b, k1, k2, p1, p2, k3, k4, k5, k6)
-        ru[i], rv[i] = fx * p + (cx - columns[3, at]), fy * q + (cy - columns[4, at])
-        fxw, fyw = fx * w, fy * w
-        ux[i], uy[i], uz[i] = fxw * by_a, fxw * cross, -fxw * (by_a * a + cross * b)
-        vx[i], vy[i], vz[i] = fyw * cross, fyw * by_b, -fyw * (cross * a + by_b * b)
+        radial, twice = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3)), 2.0 * (p1 * b + p2 * a)
+        radial = radial / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6))) + twice
+        ru[i] = fx * (a * radial + p2 * r2) + (cx - columns[3, at])
+        rv[i] = fy * (b * radial + p1 * r2) + (cy - columns[4, at])
         rx[i], ry[i], rz[i] = x, y, z
     for i in range(n if outside > 0.0 else 0):
-        u, v, ux[i], uy[i], uz[i], vx[i], vy[i], vz[i] = project_radtan(lens, rx[i], ry[i], rz[i])
+        u, v, _, _, _, _, _, _ = project_radtan(lens, rx[i], ry[i], rz[i])
         at = np.uint64(start + i)
         ru[i], rv[i] = u - columns[3, at], v - columns[4, at]
     return outside == 0.0
+
+
+@compiled(part=True, fastmath=FAST)
+def differentiate_pinhole(lens, inside, n, tile):  # type: ignore[no-untyped-def]
+    """The derivatives of a tile's pixels by its points."""
+    ux, uy, uz, vx, vy, vz = tile[UX], tile[UY], tile[UZ], tile[VX], tile[VY], tile[VZ]
+    rx, ry, rz = tile[X], tile[Y], tile[Z]
+    fx, fy, k1, k2, p1, p2, k3, k4, k5, k6 = (
+        lens[0], lens[1], lens[4], lens[5], lens[6], lens[7], lens[8], lens[9], lens[10], lens[11],
+    )  # fmt: skip
+    for i in range(n if inside else 0):
+        w = 1.0 / rz[i]
+        a, b = rx[i] * w, ry[i] * w
+        _, _, by_a, cross, _, by_b = distort(a, b, k1, k2, p1, p2, k3, k4, k5, k6)
+        fxw, fyw = fx * w, fy * w
+        ux[i], uy[i], uz[i] = fxw * by_a, fxw * cross, -fxw * (by_a * a + cross * b)
+        vx[i], vy[i], vz[i] = fyw * cross, fyw * by_b, -fyw * (cross * a + by_b * b)
+    for i in range(0 if inside else n):
+        _, _, ux[i], uy[i], uz[i], vx[i], vy[i], vz[i] = project_radtan(lens, rx[i], ry[i], rz[i])
 
 
 @compiled(part=True, fastmath=FAST)
@@ -503,106 +497,62 @@ def complete(sigma, sums):  # type: ignore[no-untyped-def]
 
 
 @compiled(part=True, fastmath=FAST)
-def add_rays(lens, whitening, scale, start, n, wanted, tile, sums):  # type: ignore[no-untyped-def]
-    """Add the sums of a tile of an undistorted pinhole, whose weights are numbers."""
-    ru, rv, psi = tile[RU], tile[RV], tile[PSI]
-    for k in range(n if len(whitening) else 0):
-        w = whitening[0, np.uint64(start + k)]
-        ru[k] *= w
-        rv[k] *= w
-    sums[7, 0] += weigh(scale, n, ru, rv, psi)
-    if wanted == COST:
-        return
-    weights = squares = 0.0
-    for k in range(n):
-        weights += psi[k]
-        squares += psi[k] * (ru[k] * ru[k] + rv[k] * rv[k])
-        ru[k] *= psi[k]
-        rv[k] *= psi[k]
-    sums[6, 6] += squares
-    sums[7, 1] += weights
-    for k in range(n if len(whitening) else 0):
-        w = whitening[0, np.uint64(start + k)]
-        ru[k] *= w
-        rv[k] *= w
-        psi[k] *= w * w
-    products, pulls = sum_rays(lens, n, tile), sum_ray_gradients(lens, n, tile)
-    row = column = 0
-    for k in range(21):
-        sums[row, column] += products[k]
-        row, column = (row, column + 1) if column < 5 else (row + 1, row + 1)  # noqa: PLR2004
-    for k in range(6):
-        sums[k, 6] += pulls[k]
+def add_by_pose(n, tile, sums):  # type: ignore[no-untyped-def]
+    """Add the sums by the pose, of a tile's residuals r and derivatives G by the points q.
 
-
-@compiled(part=True, fastmath=FAST)
-def sum_rays(lens, n, tile):  # type: ignore[no-untyped-def]
-    """The 21 sums of H of a tile of a pinhole, from a = x/z, b = y/z, w = 1/z, psi and psi r.
-
-    The rows of the Jacobian are fx (ab, -A, b, -w, 0, aw) and fy (B, -ab, -a, 0, -w, bw) with
-    A = 1 + a^2 and B = 1 + b^2: their 21 products share most of their terms, and the focal lengths
-    come in at the end. ``u05``: of the first row's entries 0 and 5, without sign and focal length.
+    J = (G [q]x, -G), and g^T [q]x = (g x q)^T. So with S = psi G^T G and C v = v x q, the blocks of
+    H are C S C^T, -C S and S, and b = (C g, -g) with g = psi G^T r.
     """
-    ray_a, ray_b, ray_w, weight = tile[A], tile[B], tile[W], tile[PSI]
-    u00 = v00 = u11 = u01 = v01 = u02 = v02 = u12 = v12 = u22 = v22 = 0.0
+    ru, rv, weight = tile[RU], tile[RV], tile[PSI]
+    ux, uy, uz, vx, vy, vz = tile[UX], tile[UY], tile[UZ], tile[VX], tile[VY], tile[VZ]
+    rx, ry, rz = tile[X], tile[Y], tile[Z]
+    h00 = h01 = h02 = h03 = h04 = h05 = h11 = h12 = h13 = h14 = h15 = h22 = h23 = h24 = h25 = 0.0
+    h33 = h34 = h35 = h44 = h45 = h55 = b0 = b1 = b2 = b3 = b4 = b5 = squares = weights = 0.0
     for i in range(n):
-        a, b, psi = ray_a[i], ray_b[i], weight[i]
-        big_a, big_b, ab = 1.0 + a * a, 1.0 + b * b, a * b
-        psi_ab, psi_a, psi_b = psi * ab, psi * big_a, psi * big_b
-        u00 += psi_ab * ab
-        v00 += psi_b * big_b
-        u11 += psi_a * big_a
-        u01 += psi_ab * big_a
-        v01 += psi_ab * big_b
-        u02 += psi_ab * b
-        v02 += psi_b * a
-        u12 += psi_a * b
-        v12 += psi_ab * a
-        u22 += psi * b * b
-        v22 += psi * a * a
-    u03 = v04 = u13 = u05 = v15 = v05 = u15 = v24 = u23 = u33 = u35 = v45 = u55 = v55 = 0.0
-    for i in range(n):
-        a, b, w, psi = ray_a[i], ray_b[i], ray_w[i], weight[i]
-        psi_ab, psi_a, psi_b = psi * a * b, psi * (1.0 + a * a), psi * (1.0 + b * b)
-        aw, bw = a * w, b * w
-        u03 += psi_ab * w
-        v04 += psi_b * w
-        u13 += psi_a * w
-        u05 += psi_ab * aw
-        v15 += psi_ab * bw
-        v05 += psi_b * bw
-        u15 += psi_a * aw
-        v24 += psi * aw
-        u23 += psi * bw
-        u33 += psi * w * w
-        u35 += psi * w * aw
-        v45 += psi * w * bw
-        u55 += psi * aw * aw
-        v55 += psi * bw * bw
-    fx, fy = lens[0], lens[1]
-    p, q = fx * fx, fy * fy
-    return (
-        p * u00 + q * v00, -p * u01 - q * v01, p * u02 - q * v02, -p * u03, -q * v04,
-        p * u05 + q * v05, p * u11 + q * u00, -p * u12 + q * v12, p * u13, q * u03,
-        -p * u15 - q * v15, p * u22 + q * v22, -p * u23, q * v24, (p - q) * u03,
-        p * u33, 0.0, -p * u35, q * u33, -q * v45, p * u55 + q * v55,
+        psi, u, v, x, y, z = weight[i], ru[i], rv[i], rx[i], ry[i], rz[i]
+        weights += psi
+        squares += psi * (u * u + v * v)
+        a, b, c, d, e, f = ux[i], uy[i], uz[i], vx[i], vy[i], vz[i]
+        pa, pb, pc, pd, pe, pf = psi * a, psi * b, psi * c, psi * d, psi * e, psi * f
+        xx, xy, xz = pa * a + pd * d, pa * b + pd * e, pa * c + pd * f
+        yy, yz, zz = pb * b + pe * e, pb * c + pe * f, pc * c + pf * f
+        h33 += xx
+        h34 += xy
+        h35 += xz
+        h44 += yy
+        h45 += yz
+        h55 += zz
+        c00, c01, c02 = z * xy - y * xz, z * yy - y * yz, z * yz - y * zz
+        c10, c11, c12 = x * xz - z * xx, x * yz - z * xy, x * zz - z * xz
+        c20, c21, c22 = y * xx - x * xy, y * xy - x * yy, y * xz - x * yz
+        h03 -= c00
+        h04 -= c01
+        h05 -= c02
+        h13 -= c10
+        h14 -= c11
+        h15 -= c12
+        h23 -= c20
+        h24 -= c21
+        h25 -= c22
+        h00 += z * c01 - y * c02
+        h01 += x * c02 - z * c00
+        h02 += y * c00 - x * c01
+        h11 += x * c12 - z * c10
+        h12 += y * c10 - x * c11
+        h22 += y * c20 - x * c21
+        gx, gy, gz = pa * u + pd * v, pb * u + pe * v, pc * u + pf * v
+        b0 += z * gy - y * gz
+        b1 += x * gz - z * gx
+        b2 += y * gx - x * gy
+        b3 -= gx
+        b4 -= gy
+        b5 -= gz
+    each = (
+        h00, h01, h02, h03, h04, h05, b0, h11, h12, h13, h14, h15, b1, h22, h23, h24, h25, b2,
+        h33, h34, h35, b3, h44, h45, b4, h55, b5, squares,
     )  # fmt: skip
-
-
-@compiled(part=True, fastmath=FAST)
-def sum_ray_gradients(lens, n, tile):  # type: ignore[no-untyped-def]
-    """The gradient of a tile of a pinhole, see ``sum_rays``."""
-    pull_u, pull_v = tile[RU], tile[RV]
-    ray_a, ray_b, ray_w = tile[A], tile[B], tile[W]
-    fx, fy = lens[0], lens[1]
-    b0 = b1 = b2 = b3 = b4 = b5 = 0.0
-    for i in range(n):
-        a, b, w, u, v = ray_a[i], ray_b[i], ray_w[i], fx * pull_u[i], fy * pull_v[i]
-        both = a * u + b * v
-        b0 += b * both + v
-        b1 -= a * both + u
-        b2 += b * u - a * v
-        b3 -= w * u
-        b4 -= w * v
-        b5 += w * both
-    return b0, b1, b2, b3, b4, b5
+    row = column = 0
+    for k in range(28):
+        sums[row, column] += each[k]
+        row, column = (row, column + 1) if column < 6 else (row + 1, row + 1)  # noqa: PLR2004
+    sums[7, 1] += weights

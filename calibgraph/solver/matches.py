@@ -116,6 +116,7 @@ class CameraBlock:
         """Norms of the residuals over the median of a standard Gaussian's.
 
         The median of Gaussian ones of one standard deviation per axis is that standard deviation.
+        Those of all at one pose are kept: scale, gate and checks ask for them one after the other.
 
         Args:
             T_camera_lidar: (1, 4, 4), or (r, 4, 4) with one of each run.
@@ -125,6 +126,14 @@ class CameraBlock:
             (n,) unweighted errors [px]; (n,) whitened errors; infinite where a point is not
             projectable.
         """
+        place, last = T_camera_lidar.tobytes(), self.__dict__.get("_last_sizes")
+        if runs is not None or last is None or last[0] != place:
+            last = place, self._sizes(T_camera_lidar, runs)
+        if runs is None:  # replaced as one, so that threads never see those of another pose
+            self.__dict__["_last_sizes"] = last
+        return last[1]
+
+    def _sizes(self, T_camera_lidar: Array, runs: NDArray[np.int64] | None) -> tuple[Array, Array]:
         medians = median_norm(self.information)
         if self.information is None:
             norms = self.block.run_norms(T_camera_lidar, runs) / medians

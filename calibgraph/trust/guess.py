@@ -76,11 +76,14 @@ def compare_with_other_guesses(guesses: Mapping[str, Array], results: Mapping[st
         yield name, row.check(float(of.min()), name=what)
 
 
+_SOME_POINTS = 1000  # know a median distance to some percent; one in other units is off by 10
+
+
 def point_distance_checks(evidence: Evidence) -> Found:
     """Whether the points can be in metres."""
     row = threshold("point_distance")
     for name, block in evidence.solution.objective.blocks.items():
-        x, y, z = block.block.points_lidar_m.T  # which need not be contiguous
+        x, y, z = block.block.points_lidar_m[:: -(-len(block) // _SOME_POINTS)].T
         yield name, row.check(float(np.median(np.sqrt(x * x + y * y + z * z))))
 
 

@@ -52,9 +52,9 @@ _TOLD_S, _TOLD_CM = 0.01, 0.1  # whose effect is told, if it has one
 def offset_checks(evidence: Evidence) -> Found:
     """The offset of each camera by the matches of a table that comes with the LiDAR's motion."""
     solution, config = evidence.solution, evidence.solution.config
-    if not {*CLOCK}.isdisjoint(config.estimate):
-        return
     table, variance = solution.correspondences, evidence.findings.place_variance
+    if table.twist_per_s is None or not {*CLOCK}.isdisjoint(config.estimate):
+        return
     for name, fit in _fit_cameras(solution.solved_rig, table, variance):
         yield name, check_offset(fit, RESIDUALS, config.tolerance)
 
@@ -133,7 +133,7 @@ def fit_offset(
 
     ``place_variance`` is what the matches of a place share, over that of independent ones.
     """
-    if len(np.unique(table.frame)) < MIN_FRAMES or table.twist_per_s is None:
+    if table.twist_per_s is None or len(np.unique(table.frame)) < MIN_FRAMES:
         return None
     sigma_s = camera.time_offset_sigma_s or LensSigmas.calibrated(camera).offset_s
     free = Columns(camera.lens, (OFFSET,), (sigma_s,), clock_of(camera))
