@@ -165,6 +165,7 @@ def test_a_lidar_that_moved_between_places_shows_in_what_places_differ_by():
     assert found.place_ratios[1] > 2.0**2  # the limit of PASS, as a variance
 
 
+@pytest.mark.usefixtures("few_placements")
 def test_clouds_that_share_nothing_are_refused_with_their_share():
     clouds, rng = record(7, places=1, beams=12), np.random.default_rng(8)
     elsewhere = draw_place(rng, boxes=6, fronts=False)

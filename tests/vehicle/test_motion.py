@@ -15,6 +15,8 @@ from calibgraph.model.geometry import invert, move_points, transform
 from factors import displace
 from tests.vehicle.scenes import ALL_AROUND_DEG, HEIGHT_M, MOUNTS, draw_place, scan
 
+pytestmark = pytest.mark.usefixtures("few_placements")
+
 START_NS, SLICES, SCAN_S = 1_700_000_000_000_000_000, 12, 0.1
 LATE_S = {"top": 0.0, "front": 0.03}  # the begin of its scan after the instant's stamp
 

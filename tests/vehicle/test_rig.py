@@ -24,6 +24,8 @@ from calibgraph.vehicle import start
 from tests.conftest import SAMPLE, Call, require_poses
 from tests.vehicle.scenes import HEIGHT_M, MOUNTS, displaced, draw_place, record, scan
 
+pytestmark = pytest.mark.usefixtures("few_placements")
+
 RIG = {"format": "calibgraph-rig/1", "lidar": "top", "lidars": {name: {} for name in MOUNTS}}
 
 
@@ -104,10 +106,7 @@ def test_clouds_in_millimetres_are_refused(tmp_path: Path):
         calibgraph.calibrate(tmp_path)
 
 
-def test_clouds_of_a_drive_that_are_a_frame_late_are_no_pass(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    monkeypatch.setattr(start, "_TRIED", 2)
+def test_clouds_of_a_drive_that_are_a_frame_late_are_no_pass(tmp_path: Path):
     rng, boxes, step = np.random.default_rng(3), draw_place(np.random.default_rng(1)), 0.2
     for name, late in (("top", 0.0), ("left", 1.0)):
         (tmp_path / "lidars" / name).mkdir(parents=True)
