@@ -200,7 +200,7 @@ def calibrate_sample(folder: Path) -> CommandRun:
 
 @pytest.fixture
 def no_image_checks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Do not check results and guesses against the images, for tests of all else."""
+    """Do not check results, guesses and other images against the images, for tests of all else."""
     monkeypatch.setattr(image_evidence, "check_images", lambda *_, **__: [])
     for module in (assess, inputs):
         monkeypatch.setattr(module, "likely_intended_guess", lambda *_: None)

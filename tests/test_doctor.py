@@ -127,7 +127,7 @@ def test_the_command_prints_it_and_exits_with_one_if_anything_is_to_be_fixed(
 ) -> None:
     code, out, err = call("doctor", folder)
     assert (code, out) == (0, "")
-    assert "note     6 frames, 2 cameras\n" in err
+    assert "note     6 frames, 2 cameras\n" in err and "note     1 place: frames 0-5\n" in err
     (folder / "lidar/000003.npy").unlink()
     code, out, _ = call("doctor", folder, "--json")
     assert code == 1

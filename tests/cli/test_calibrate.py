@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 import yaml
 
@@ -126,11 +127,15 @@ def test_a_failed_calibration_exits_1_its_files_are_marked_and_its_page_is_writt
         ["-"] * 6
     ]
     content = yaml.safe_load((out / "calibration.yaml").read_text())
+    assert content["verdict"]["status"] == "FAIL"
     assert content["error_bar_holds"]["left->right"] is False
+    metadata = pq.read_schema(out / "correspondences.parquet").metadata
+    assert any(b'"FAIL"' in value for value in metadata.values())
     export = ("export", out, "--format", "json", "--out", tmp_path / "a.json")
     assert "is FAIL, nothing was written" in error_line(*call(*export))
     assert call(*export, "--even-if-failed")[0] == 0
     page = (out / "report.html").read_text()
+    assert "FAIL" in page.split("</title>")[0]
     (out / "report.html").unlink()
     code, _, stderr = call("report", out)
     assert code == 0 and "the verdict is FAIL" in stderr

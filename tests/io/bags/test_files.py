@@ -61,7 +61,6 @@ def write_mcap(
     messages: list[Stamped],
     *,
     kind: str = "mcap",
-    profile: str = "ros2",
     beside: str = "",
     **options: Any,
 ) -> Path:
@@ -71,7 +70,6 @@ def write_mcap(
         path: of the file.
         messages: in any order.
         kind: ros1, or mcap for those of ROS 2.
-        profile: of the header.
         beside: the encoding of a further channel.
         options: of the writer.
     """
@@ -79,7 +77,7 @@ def write_mcap(
     store = STORES[ros1]
     with path.open("wb") as file:
         writer = Writer(file, **{"chunk_size": 200_000, **options})
-        writer.start(profile, "test")
+        writer.start("ros2", "test")
         if beside:
             number = writer.register_schema("foxglove.Notes", f"{beside}schema", b"{}")
             notes = writer.register_channel("/notes", beside, number)
