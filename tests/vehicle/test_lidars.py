@@ -49,6 +49,7 @@ def sigmas(found: LidarPoses, name: str) -> Array:
     return np.sqrt(np.diag(found.covariance[name]))
 
 
+@pytest.mark.usefixtures("few_placements")
 def test_poses_are_found_without_a_guess_upside_down_too():
     clouds = record(1, places=2, mounts={"top": MOUNTS["top"], "down": UPSIDE_DOWN})
     start, doubts, _ = locate_lidars(look(clouds), {"down": None}, base="top")
@@ -180,6 +181,7 @@ def test_clouds_that_share_nothing_are_refused_with_their_share():
         calibrate_lidars(look(clouds), MOUNTS, base="top")
 
 
+@pytest.mark.usefixtures("few_placements")
 def test_a_lidar_without_ground_near_it_is_placed_by_its_guess():
     clouds = record(2, places=1, mounts=TWO)
     clouds["top"] = [of[np.linalg.norm(of, axis=1) > 15.0] for of in clouds["top"]]
