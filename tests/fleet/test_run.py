@@ -89,9 +89,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def alone(folder: Path) -> dict[tuple[str, str], dict[str, Any]]:
     """The rows of the good vehicle when there are no others."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("calibgraph.fleet.run.run_job", run_here)
-        run_fleet(str(folder / "fleet.csv"), str(folder / "alone"))
+    with thread_executor(1) as executor:
+        run_fleet(
+            str(folder / "fleet.csv"), str(folder / "alone"), executor=executor, limits=LIMITS
+        )
     return rows_of(str(folder / "alone"))
 
 

@@ -188,7 +188,8 @@ def test_a_mistake_is_recognised_by_the_images_at_a_rough_guess(error: str, seed
     rough = rough_guess(seed)
     T = {name: mistaken(error, T) for name, T in rough.T_camera_lidar.items()}
     wrong = rough.moved_to(T)
-    found = likely_intended_guess(one_frame(), wrong)
+    one_frame = calibgraph.load_dataset(SAMPLE, rough, frames="0")  # a mistake is seen in one
+    found = likely_intended_guess(one_frame, wrong)
     assert f"fit clearly better if {in_words(error)}; undo it" in found
     assert f"--correct {error} " in found
     undone = correct_guess(wrong, [error])
@@ -214,12 +215,8 @@ def test_no_mistake_is_seen_in_a_guess_that_is_only_rough(
     rotation_deg: float, translation_m: float
 ) -> None:
     rough = rough_guess(6, rotation_deg, translation_m)
-    assert likely_intended_guess(one_frame(), rough) is None
-
-
-def one_frame() -> calibgraph.Dataset:
-    """The first of the sample, of these cameras: a mistake is seen in one already."""
-    return calibgraph.load_dataset(SAMPLE, rough_guess(0), frames="0")
+    one_frame = calibgraph.load_dataset(SAMPLE, rough, frames="0")
+    assert likely_intended_guess(one_frame, rough) is None
 
 
 def rough_guess(seed: int, rotation_deg: float = 4.0, translation_m: float = 0.3) -> calibgraph.Rig:
