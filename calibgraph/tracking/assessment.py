@@ -207,42 +207,38 @@ def make_updates(
 
 def json_lines(updates: Sequence[Update]) -> list[str]:
     """A line of JSON of each update; units are in the keys, matrices row by row."""
-    held, estimates, lines = None, dict[str, str](), []
+    held, estimates, lines = None, dict[str, dict[str, Any]](), []
     for update in updates:
         if update.verdicts is not held:  # frames taken in at once have the same
             held = update.verdicts
             estimates = {name: _estimate(update, name) for name in update.T_camera_lidar}
-        cameras = (
-            f'{_text(name)}: {text[:-1]}, "used": {update.used.get(name, 0)}, '
-            f'"left_out": {_text(name in update.left_out)}}}'
-            for name, text in estimates.items()
-        )
-        head = _text({"frame": update.frame, "stamp_ns": update.stamp_ns})
-        events = _text([*map(_event, update.events)])
-        lines.append(f'{head[:-1]}, "cameras": {{{", ".join(cameras)}}}, "events": {events}}}')
+        cameras = {
+            name: {**own, "used": update.used.get(name, 0), "left_out": name in update.left_out}
+            for name, own in estimates.items()
+        }
+        head = {"frame": update.frame, "stamp_ns": update.stamp_ns}
+        content = {**head, "cameras": cameras, "events": [*map(_event, update.events)]}
+        try:
+            lines.append(json.dumps(content, allow_nan=False))
+        except ValueError:  # of numbers that JSON does not have
+            lines.append(json.dumps(finite(content), allow_nan=False))
     return lines
 
 
-def _text(content: object) -> str:
-    return json.dumps(finite(content), allow_nan=False)
-
-
-def _estimate(update: Update, name: str) -> str:
+def _estimate(update: Update, name: str) -> dict[str, Any]:
     """What holds for all frames that were taken in at once."""
     covariance, verdict = update.covariance[name], update.verdicts[name]
     sigmas = None if covariance is None else np.sqrt(np.diag(covariance))
-    reasons = list(verdict.reasons)
-    content = {
+    return {
         "T_camera_lidar": update.T_camera_lidar[name].tolist(),
         "covariance": None if covariance is None else covariance.tolist(),
         "rotation_sigma_deg": None if sigmas is None else np.degrees(sigmas[:3]).tolist(),
         "translation_sigma_cm": None if sigmas is None else (100 * sigmas[3:]).tolist(),
         "verdict": verdict.status,
         "cannot_tell": verdict.cannot_tell,
-        "reasons": reasons,
-        "actions": list(summarize({name: verdict}).actions) if reasons else [],
+        "reasons": list(verdict.reasons),
+        "actions": list(summarize({name: verdict}).actions) if verdict.reasons else [],
     }
-    return _text(content)
 
 
 def _event(event: Event) -> dict[str, Any]:
