@@ -22,8 +22,10 @@ from calibgraph import (
     MatcherErrors,
     RelativePose,
     Rig,
+    doctor,
     evaluate,
     load_rig,
+    rounds,
     simulate_correspondences,
 )
 from calibgraph.cli import app as cli
@@ -198,10 +200,14 @@ def calibrate_sample(folder: Path) -> CommandRun:
 
 @pytest.fixture
 def no_image_checks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Do not check results and guesses against the images, for tests of all else."""
+    """Do not check results, guesses and other images against the images, for tests of all else."""
     monkeypatch.setattr(image_evidence, "check_images", lambda *_, **__: [])
     for module in (assess, inputs):
         monkeypatch.setattr(module, "likely_intended_guess", lambda *_: None)
+    monkeypatch.setattr(rounds, "require_different_images", lambda *_: None)
+    monkeypatch.setattr(doctor, "find_same_images", lambda *_: [])
+    for module in (rounds, doctor):
+        monkeypatch.setattr(module, "hide_burnt_in", lambda data, _: data)
 
 
 def make_pair() -> Rig:

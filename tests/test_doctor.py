@@ -9,13 +9,18 @@ import cv2
 import numpy as np
 import pytest
 
-from calibgraph import Diagnosis, Rig, diagnose, load_rig
+from calibgraph import Dataset, Diagnosis, Rig, diagnose, doctor, load_rig
 from tests.conftest import SAMPLE, Call
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    """A copy of two cameras of the sample."""
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of two cameras of the sample, of one place."""
+
+    def one_place(data: Dataset, *_: object) -> list[list[int]]:
+        return [[frame.index for frame in data.frames]]
+
+    monkeypatch.setattr(doctor, "find_places", one_place)
     folder = Path(shutil.copytree(SAMPLE, tmp_path / "sample"))
     shutil.rmtree(folder / "cameras" / "front_right")
     cameras = load_rig(SAMPLE).cameras
@@ -122,7 +127,7 @@ def test_the_command_prints_it_and_exits_with_one_if_anything_is_to_be_fixed(
 ) -> None:
     code, out, err = call("doctor", folder)
     assert (code, out) == (0, "")
-    assert "note     6 frames, 2 cameras\n" in err
+    assert "note     6 frames, 2 cameras\n" in err and "note     1 place: frames 0-5\n" in err
     (folder / "lidar/000003.npy").unlink()
     code, out, _ = call("doctor", folder, "--json")
     assert code == 1

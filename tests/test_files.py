@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from calibgraph import FileError, load_rig
+from calibgraph import FileError, files, load_rig
 from calibgraph.errors import in_words, printable
 from calibgraph.files import read_yaml, write_atomically, write_text, written_together
 from calibgraph.yaml_text import parse_yaml
@@ -134,7 +134,11 @@ def texts(folder: Path) -> dict[str, str]:
     return {path.name: path.read_text() for path in folder.iterdir() if path.is_file()}
 
 
-def test_files_that_are_written_together_appear_together_or_not_at_all(tmp_path: Path) -> None:
+def test_files_that_are_written_together_appear_together_or_not_at_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synced = list[Path]()
+    monkeypatch.setattr(files, "sync_to_disk", synced.append)
     old = tmp_path / "a.txt"
     old.write_text("old")
     full = OSError(errno.ENOSPC, "No space left on device")
@@ -148,6 +152,7 @@ def test_files_that_are_written_together_appear_together_or_not_at_all(tmp_path:
     assert caught.value.filename == str(tmp_path / "lidar" / "b.npy")
     assert ([*tmp_path.iterdir()], old.read_text()) == ([old], "old")
     write_all(tmp_path, "new")
+    assert {path.name for path in synced} >= {*NAMES} and synced[-1] == tmp_path, "the renames"
     assert texts(tmp_path) == dict.fromkeys(NAMES, "new")
     assert len([*tmp_path.iterdir()]) == len(NAMES)
 

@@ -127,11 +127,10 @@ def calibrated(
 @pytest.mark.parametrize(
     "case",
     [
-        "one camera",
         "excluded camera",
         *(
             pytest.param(each, marks=pytest.mark.slow)
-            for each in ("no overlap", "overlap", "relative pose", "no time")
+            for each in ("one camera", "no overlap", "overlap", "relative pose", "no time")
         ),
     ],
 )
@@ -158,6 +157,8 @@ def test_places_of_the_table_count_in_the_solve(guess: Rig, truth: Rig) -> None:
         assert np.trace(b[:3, :3]) < 0.9 * np.trace(a[:3, :3])
 
 
+@pytest.mark.ci
+@pytest.mark.slow
 def test_the_commands_solve_what_calibrate_saved(
     guess: Rig, truth: Rig, recordings: Sequence[Path], tmp_path: Path, call: Call
 ) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -84,7 +84,7 @@ class VarianceRatios:
 
     def is_near(self, other: VarianceRatios) -> bool:
         """Whether all are the same to some percent."""
-        pairs = zip(astuple(self), astuple(other), strict=True)
+        pairs = zip(vars(self).values(), vars(other).values(), strict=True)
         return all(abs(one - two) <= _SETTLED * abs(two) for one, two in pairs)
 
 

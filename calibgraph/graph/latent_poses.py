@@ -29,7 +29,6 @@ from functools import cached_property
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag
 
 from calibgraph.arrays import Array
 from calibgraph.graph.components import EXACT, VarianceComponents
@@ -190,17 +189,16 @@ class LatentPoseModel:
     def reported(self, values: gtsam.Values, of: Reported) -> tuple[Array, Array]:
         """(N, 4, 4) T_camera_lidar of mounts or alignments; (6 N, n) derivative by all columns."""
         mounts = [values.atPose3(key).inverse().matrix() for key in self.camera_keys]
-        T, rows = np.array(mounts), np.zeros((6 * len(mounts), self.size))
-        at = self.columns_of(self.camera_keys)
-        rows[np.arange(len(rows)), at] = 1.0
-        if of == "mount" or not self.is_distorted:
-            return T, rows
-        away = self.alignment @ values.atVector(DISTORTION)
-        turn = adjoints(retract_all(np.tile(np.eye(4), (len(T), 1, 1)), away))
-        rows[:, at] = block_diag(*turn)
-        by_distortion = right_jacobians(away) @ self.alignment
-        rows[:, self.columns[DISTORTION]] = by_distortion.reshape(len(rows), -1)
-        return retract_all(T, away), rows
+        T, rows = np.array(mounts), np.zeros((len(mounts), 6, self.size))
+        at = self.columns_of(self.camera_keys).reshape(-1, 1, 6)
+        own = np.arange(len(mounts))[:, None, None], np.arange(6)[:, None], at
+        rows[own] = np.eye(6)
+        if of == "alignment" and self.is_distorted:
+            away = self.alignment @ values.atVector(DISTORTION)
+            rows[own] = adjoints(retract_all(np.tile(np.eye(4), (len(T), 1, 1)), away))
+            rows[..., self.columns[DISTORTION]] = right_jacobians(away) @ self.alignment
+            T = retract_all(T, away)
+        return T, rows.reshape(-1, self.size)
 
     def lens_keys(self, number: int) -> list[int]:
         """Key of ``s_c``, if the lens of the camera is estimated."""

@@ -13,6 +13,7 @@ s_c   that lens as its matches show it
 """
 
 from collections.abc import Callable
+from functools import cache
 
 import gtsam
 
@@ -28,7 +29,7 @@ Key = Callable[[int], int]
 
 def _keys_of(letter: str) -> Key:
     """From the number of a camera or place to the key of its variable."""
-    return lambda number: int(gtsam.symbol(letter, number))
+    return cache(lambda number: int(gtsam.symbol(letter, number)))
 
 
 camera_key, aligned_key, matched_key, paired_key = map(_keys_of, "xymn")

@@ -28,7 +28,6 @@ from calibgraph.tracking.sums import Sums
 from factors import BlockSums, to_runs
 from factors.pose_kernel import logarithms
 
-_ABSORBED = [COUNTS.index(name) for name in ("given", "used", "absorbed")]
 _LAST_FRAMES = 20  # of which it is kept whether they agree with the estimate
 _UNUSUAL = 25.0  # squared sigmas of a six-vector
 _TOTAL_KEPT = 1 - 1 / 2000  # of the total scatter, from frame to frame
@@ -64,7 +63,6 @@ def absorb(state: State, gated: Mapping[int, Gated]) -> None:
     numbers = np.concatenate([one.raw.frame_numbers for one in kept.values()])
     rows = np.searchsorted(state.numbers, numbers)
     state.sums = state.sums.replace_at((rows, cameras), sums_of(state, kept))
-    state.counts = state.counts.copy()
     for camera, one in kept.items():
         agreed = ((number, True) for number in one.raw.frame_numbers.tolist())
         state.put(
@@ -72,7 +70,8 @@ def absorb(state: State, gated: Mapping[int, Gated]) -> None:
             matches=(*state.matches[camera], one),
             agreements=(*state.agreements[camera], *agreed)[-_LAST_FRAMES:],
         )
-        state.counts[camera, _ABSORBED] += [len(one.inliers), int(one.counts.sum()), one.raw.frames]
+        given, used, absorbed = len(one.inliers), int(one.counts.sum()), one.raw.frames
+        state.count(camera, given=given, used=used, absorbed=absorbed)
 
 
 def sums_of(state: State, gated: Mapping[int, Gated]) -> Sums:
@@ -86,28 +85,23 @@ def sums_of(state: State, gated: Mapping[int, Gated]) -> Sums:
         gated: by camera; linearized at its poses.
     """
     parts, cameras = [], list[int]()
-    for camera, one in gated.items():
-        edges = np.concatenate([[0], one.counts.cumsum().astype(np.int64)])
-        block = one.raw.with_scale(state.scales[camera]).select(one.inliers)
-        parts.append(block.summarize(one.poses, to_runs(edges)))
-        cameras += [camera] * one.raw.frames
+    for camera, own in gated.items():
+        edges = np.concatenate([[0], own.counts.cumsum().astype(np.int64)])
+        block = own.inside.with_scale(state.scales[camera])
+        parts.append(block.summarize(own.poses, to_runs(edges)))
+        cameras += [camera] * own.raw.frames
     here, to = BlockSums.join(parts), state.references[cameras]
-    poses = np.concatenate([one.poses for one in gated.values()])
+    poses = np.concatenate([own.poses for own in gated.values()])
     root = np.linalg.cholesky(here.hessian + WEAK)
     hessian = root @ state.curvature[cameras] @ root.swapaxes(1, 2)
     gradient = here.gradient
     if not np.array_equal(poses, to):
         steps = logarithms(poses @ invert(to))
         gradient = gradient + (hessian @ steps[..., None])[..., 0]
-    return Sums.zeros(len(cameras)).change(
-        hessian=hessian,
-        gradient=gradient,
-        reweighted=here.hessian,
-        score=gradient,
-        scatter=gradient[:, :, None] * gradient[:, None, :],
-        frames=np.ones(len(cameras)),
-        matches=np.concatenate([one.counts for one in gated.values()]),
-    )
+    scatter, frames = gradient[:, :, None] * gradient[:, None, :], len(cameras)
+    matches = np.concatenate([own.counts for own in gated.values()])
+    values = hessian, here.hessian, scatter, gradient, gradient, np.ones(frames), matches
+    return Sums(np.concatenate([each.reshape(frames, -1) for each in values], axis=1))
 
 
 def add_to_totals(state: State, frames: Sums) -> None:
@@ -227,7 +221,7 @@ def count_absent(state: State, used: Collection[int], frame: StreamFrame) -> lis
         frame: this one.
     """
     events, limit, number = [], state.config.tracking.blind_frames, frame.frame
-    absent = np.where(state.started, state.absent + 1, state.absent)
+    absent = state.absent + state.started
     absent[[*used]] = 0
     for camera in np.flatnonzero(state.started & (absent != state.absent)).tolist():
         name = state.names[camera]
@@ -294,7 +288,7 @@ def _start_camera(state: State, camera: int, T_camera_lidar: Array) -> None:
         started=True, waiting=(), references=T_camera_lidar,
         scales=scale, share=gated.usual_share, curvature=curvature,
     )  # fmt: skip
-    _consider_lens(state, camera, raw.select(gated.inliers))
+    _consider_lens(state, camera, gated.inside)
     absorb_again(state, camera, raw, T_camera_lidar)
 
 
@@ -356,5 +350,5 @@ def absorb_again(state: State, camera: int, raw: CameraBlock | None, T_camera_li
     own, bends = state.matches_of(camera), state.bends[camera].copy()
     bends[:54] = 0.0  # the matches follow the distortion in another way
     if own is not None:
-        bends[:54] = _bends_of(state, camera, own.raw.select(own.inliers))[:54]
+        bends[:54] = _bends_of(state, camera, own.inside)[:54]
     state.put(camera, bends=bends)

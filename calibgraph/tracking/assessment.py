@@ -237,7 +237,7 @@ def _estimate(update: Update, name: str) -> dict[str, Any]:
         "verdict": verdict.status,
         "cannot_tell": verdict.cannot_tell,
         "reasons": list(verdict.reasons),
-        "actions": list(summarize({name: verdict}).actions),
+        "actions": list(summarize({name: verdict}).actions) if verdict.reasons else [],
     }
 
 

@@ -106,18 +106,20 @@ def _regate(state: State, camera: int, places: Numbers, *, is_steady: bool) -> N
     sizes_px, sizes = raw.all_sizes(poses, to_runs(raw.frame_edges))
     if raw.frames >= state.config.tracking.epoch_frames:
         scale = raw.scale_of(sizes_px, sizes, state.config)
-    gated = Gated(raw, sizes_px * median_norm(raw.information) <= scale.gate_px, poses)
-    state.put(camera, scales=scale, share=gated.usual_share)
-    if (shown := gated.select(newest) if state.walk[camera] else gated).enough.any():
-        state.put(camera, curvature=shown.curvature(reference, scale))
-    within = np.where(np.repeat(gated.enough, raw.frame_counts), gated.inliers, own.inliers)
-    gated = Gated(raw, within, poses)
-    state.put(camera, matches=(gated,))
+    at = poses
     if not state.walk[camera]:
         steps = np.zeros((len(rows), 6))
         if state.config.preset == "auto":  # Eq. 5 knows no places
             steps = np.concatenate([state.steps[:, camera], steps[:1]])[places[rows]]
-        gated = Gated(raw, within, retract_all(reference[None].repeat(len(rows), axis=0), steps))
+        at = retract_all(reference[None].repeat(len(rows), axis=0), steps)
+    gated = Gated(raw, sizes_px * median_norm(raw.information) <= scale.gate_px, at)
+    state.put(camera, scales=scale, share=gated.usual_share)
+    if (shown := gated.select(newest) if state.walk[camera] else gated).enough.any():
+        state.put(camera, curvature=shown.curvature(reference, scale))
+    if not gated.enough.all():
+        within = np.where(np.repeat(gated.enough, raw.frame_counts), gated.inliers, own.inliers)
+        gated = Gated(raw, within, at)
+    state.put(camera, matches=(Gated(raw, gated.inliers, poses),))
     state.sums = state.sums.replace_at((rows, camera), sums_of(state, {camera: gated}))
 
 

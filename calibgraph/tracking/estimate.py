@@ -159,9 +159,9 @@ class Terms:
         of_v = (v * np.linalg.solve(self.at_place, v[..., None])[..., 0]).sum(axis=-1)
         return np.column_stack([of_u, np.where(self.seen, of_v, 0.0)])
 
-    def weigh(self, u: Array, v: Array) -> Array:
-        """(P, 1 + n) weights of such displacements in the loss of Geman and McClure."""
-        return np.asarray((1.0 + self.squared(u, v) / self.robust_scale**2) ** -2)
+    def weigh(self, squared: Array) -> Array:
+        """(P, 1 + n) weights of displacements by :meth:`squared`, in Geman and McClure's loss."""
+        return np.asarray((1.0 + squared / self.robust_scale**2) ** -2)
 
     def known_weights(self, state: State) -> Array:
         """(P, 1 + n) weights at the optimum of the last epoch, 1 of new places."""
@@ -175,7 +175,8 @@ class Terms:
         weights, new = self.known_weights(state), self.known < 0
         for _ in range(_OPEN_WEIGHINGS if np.isfinite(self.robust_scale) and new.any() else 0):
             found = self.eliminate(weights, chain)
-            weights[new] = self.weigh(*found.displacements(state.shared))[new]
+            squared = self.squared(*found.displacements(state.shared))
+            weights[new] = self.weigh(squared)[new]
         return weights
 
 
@@ -285,6 +286,8 @@ class EpochGraph:
         rig, T = state.rig.model_copy(update={"relative_poses": pairs}), self.rig.T_camera_lidar
         self.pose_graph = objective_graph(rig, {}, T, state.config, terms="full")
         self.prior = pose_equations(self.pose_graph, state.names, T)
+        travel = state.travel.reshape(-1, state.travel.shape[2])
+        self._considered = block_diagonal(state.lens_errors) + travel @ travel.T
         self.window = self.new_window(state)
         self._held: dict[frozenset[str], tuple[Array, Array]] = {}
 
@@ -327,10 +330,8 @@ class EpochGraph:
         T, covariance = self.window.reported(state.config.of)
         if state.config.preset != "auto":
             T = retract_all(state.references, self.equation_5(sums))
-        travel = state.travel.reshape(len(covariance), -1)
-        covariance = covariance + block_diagonal(state.lens_errors) + travel @ travel.T
-        few = np.repeat(sums.frames < ENOUGH_FRAMES, 6)
-        covariance[few], covariance[:, few] = np.nan, np.nan
+        unknown = np.where(sums.frames < ENOUGH_FRAMES, np.nan, 0.0).repeat(6)
+        covariance = covariance + self._considered + np.add.outer(unknown, unknown)
         return Estimate(T, covariance, sums, self._conflicts(state, sums), self.window)
 
     def open_spread(self, state: State, every: PlaceSums) -> Spread:
@@ -452,10 +453,10 @@ def settle(state: State) -> EpochGraph:
     shows_ratios = len(rows) > 1 or bool(len(rows) and state.rig.relative_poses)
     for left in range(_ROUNDS if shows_ratios else 0, -1, -1):
         terms = Terms.of(state, graph.places, rows, graph.spread)
-        found = _fit(state, terms, graph.window)
+        fit = _fit(state, terms, graph.window)
         if not left:
             break
-        evidence = _evidence(state, terms, found, graph.window)
+        evidence = _evidence(state, terms.seen, fit, graph.window)
         ratios = ratios_by_evidence(evidence, places=len(rows), present=state.ratios)
         if ratios.is_near(state.ratios):
             break
@@ -473,10 +474,11 @@ def locate_places(state: State, graph: EpochGraph) -> None:
         _fit(state, Terms.of(state, every, rows, graph.spread), graph.window)
 
 
-def _fit(state: State, terms: Terms, window: Window) -> Eliminated:
+def _fit(state: State, terms: Terms, window: Window) -> tuple[Eliminated, Array]:
     """Find where matches show the cameras, at all places and at each, and the weights of these.
 
-    In a robust loss those of new places start from 1. The places are left eliminated.
+    In a robust loss those of new places start from 1. The places are left eliminated, with the
+    squared sigmas of their displacements.
     """
     weights = terms.known_weights(state)
     for _ in range(_MOST_WEIGHINGS):
@@ -484,23 +486,23 @@ def _fit(state: State, terms: Terms, window: Window) -> Eliminated:
         window.exchange(found.hessian, found.gradient)
         shown = window.shown
         u, v = found.displacements(shown)
-        new = terms.weigh(u, v)  # 1 in a loss that is not robust
+        squared = terms.squared(u, v)
+        new = terms.weigh(squared)  # 1 in a loss that is not robust
         if not new.size or np.abs(new - weights).max() < _SAME_WEIGHT:
             break
         weights = new
     state.settled, state.weights, state.shared = terms.names, weights, shown
     state.steps = found.at_places(shown, u, v)
-    return found
+    return found, squared
 
 
 def _evidence(
-    state: State, terms: Terms, found: Eliminated, window: Window
+    state: State, seen: Mask, fit: tuple[Eliminated, Array], window: Window
 ) -> dict[Component, Evidence]:
     """Per component its weighted sum of squares, and what of its freedom the data determine."""
-    weights = state.weights
-    squared = weights * terms.squared(*found.displacements(state.shared))
-    open_u, open_v = found.open_freedom(window.covariance_of_shown)
-    present, parts = weights[:, 1:][terms.seen], window.model.components
+    weights, squared = state.weights, state.weights * fit[1]
+    open_u, open_v = fit[0].open_freedom(window.covariance_of_shown)
+    present, parts = weights[:, 1:][seen], window.model.components
     model, known, distortions = window.model, 0.0, 0
     if model.is_distorted:  # its residuals count as a part of its prior
         distortions, known = parts.distortion_jacobian.shape[2], least_cost_of_distortion(parts)
@@ -509,5 +511,5 @@ def _evidence(
     return {
         "shared": Evidence(shared, variables - window.undetermined()),
         "cloud": Evidence(squared[:, 0].sum(), 6.0 * weights[:, 0].sum() - open_u.sum()),
-        "cameras": Evidence(squared[:, 1:].sum(), 6.0 * present.sum() - open_v[terms.seen].sum()),
+        "cameras": Evidence(squared[:, 1:].sum(), 6.0 * present.sum() - open_v[seen].sum()),
     }

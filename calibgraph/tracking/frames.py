@@ -282,7 +282,9 @@ def prepared(state: State, frame: StreamFrame, last: int | None) -> StreamFrame:
 
 def as_kept(frame: StreamFrame) -> StreamFrame:
     """The frame with no more metadata than an update uses."""
-    table = frame.table.with_metadata(findings_of(frame.table.findings).to_metadata())
+    table = frame.table
+    if table.metadata:
+        table = table.with_metadata(findings_of(table.findings).to_metadata())
     return StreamFrame(frame.frame, table, frame.stamp_ns, _place_of(frame))
 
 

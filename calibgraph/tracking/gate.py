@@ -63,6 +63,11 @@ class Gated:
         """(f,) how many matches of each frame are within the gate."""
         return np.add.reduceat(self.inliers, self.raw.frame_edges[:-1], dtype=np.float64)
 
+    @cached_property
+    def inside(self) -> CameraBlock:
+        """The matches within the gate."""
+        return self.raw.select(self.inliers)
+
     @property
     def usual_share(self) -> float:
         """Median over the frames of the share of their matches within the gate."""
@@ -90,8 +95,7 @@ class Gated:
 
         With what the gate's moving with the extrinsic adds.
         """
-        block = self.raw.with_scale(scale).select(self.inliers)
-        here = block.summarize(T_camera_lidar[None], curvature=True)
+        here = self.inside.with_scale(scale).summarize(T_camera_lidar[None], curvature=True)
         assert here.curvature is not None
         true = here.curvature[0] + self.raw.gate_hessian(T_camera_lidar, scale)
         inverse = np.linalg.inv(np.linalg.cholesky(here.hessian[0] + WEAK))

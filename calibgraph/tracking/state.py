@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import accumulate, pairwise
+from itertools import accumulate
 from typing import Any, TypeVar
 
 import numpy as np
@@ -326,8 +326,9 @@ class State:
     def sums_of_epochs(self, before: int | None = None) -> Sums:
         """(E, n) of each epoch, of frames before a number."""
         end = len(self.numbers) if before is None else self.first_row(before)
-        edges = pairwise(np.minimum(self.edges, end).tolist())
-        return Sums(np.array([self.sums.packed[first:last].sum(axis=0) for first, last in edges]))
+        none = Sums.zeros(1, len(self.names))  # of an epoch without frames
+        frames = np.concatenate([self.sums.packed[:end], none.packed])
+        return Sums(np.add.reduceat(frames, np.minimum(self.edges[:-1], end)))
 
     def sums_before_epochs(self, before: int | None = None) -> Sums:
         """(E + 1, n) over the frames before each epoch, the older ones too; and over all of them.

@@ -2,7 +2,7 @@
 
 The places are one factor on the cloud and on the cameras as matches show them; every update
 exchanges it. The graph is linear but for its priors, and linearized at the references of the epoch.
-Two exchanges of a blank factor come first: from then on iSAM2 eliminates in one order, so that its
+One exchange of a blank factor comes first: from then on iSAM2 eliminates in one order, so that its
 numbers depend on the last factor alone, to the last bit, and a restart gives the same.
 """
 
@@ -49,6 +49,9 @@ class Window:
         if model.is_distorted:
             shared.insert(DISTORTION, np.zeros(model.components.distortion_jacobian.shape[2]))
         shared.insert(self._start)
+        rows = [slice(row, row + _POSE) for row in range(0, _POSE * len(self._keys), _POSE)]
+        self._pairs = [*combinations(zip(self._keys, rows, strict=True), 2)]
+        self._mount_columns = model.columns_of(self._mount_keys)
         size = _POSE * len(cameras)
         self.chain = np.hstack([-adjoints(references).reshape(-1, _POSE), np.eye(size)])
         self._rounded = 1.0 + _ROUNDING * np.eye(_POSE + size)
@@ -59,8 +62,7 @@ class Window:
         parameters.findUnusedFactorSlots = True
         self._isam, self._all, self._slots = gtsam.ISAM2(parameters), shared, list[int]()
         self._isam.update(model.shared_graph, shared)
-        for _ in range(2):
-            self.exchange(self.chain.T @ self.chain, np.zeros(_POSE + size))
+        self.exchange(self.chain.T @ self.chain, np.zeros(_POSE + size))
 
     def exchange(self, hessian: Array, gradient: Array) -> None:
         """Put a quadratic on the cloud and the cameras in the place of the one before.
@@ -79,13 +81,10 @@ class Window:
     def _factor(self, hessian: Array, vector: Array) -> gtsam.HessianFactor:
         """The quadratic as one factor, from those of pairs that share what is of one variable."""
         parts, share = gtsam.GaussianFactorGraph(), 1.0 / (len(self._keys) - 1)
-        rows = [slice(_POSE * i, _POSE * i + _POSE) for i in range(len(self._keys))]
-        for (a, one), (b, two) in combinations(zip(self._keys, rows, strict=True), 2):
-            own, other = (share * hessian[at, at] for at in (one, two))
-            pulls = share * vector[one], share * vector[two]
-            parts.push_back(
-                gtsam.HessianFactor(a, b, own, hessian[one, two], pulls[0], other, pulls[1], 0.0)
-            )
+        own, pull = share * hessian, share * vector
+        for (a, one), (b, two) in self._pairs:
+            of_both = own[one, one], hessian[one, two], pull[one], own[two, two], pull[two]
+            parts.push_back(gtsam.HessianFactor(a, b, *of_both, 0.0))
         return gtsam.HessianFactor(parts)
 
     @property
@@ -105,7 +104,7 @@ class Window:
     def reported(self, of: Reported) -> tuple[Array, Array]:
         """(n, 4, 4) T_camera_lidar of mounts or alignments; (6 n, 6 n) their marginal."""
         T, rows = self.model.reported(self.values, of)
-        rows = rows[:, self.model.columns_of(self._mount_keys)]
+        rows = rows[:, self._mount_columns]
         return T, rows @ self.covariance(self._mount_keys) @ rows.T
 
     def covariance(self, keys: Sequence[int]) -> Array:

@@ -175,6 +175,8 @@ def test_unchanged_rigs_raise_at_most_one_false_alarm_in_a_hundred() -> None:
     assert alarms <= 1 + 4  # a Poisson count of at most 1 %
 
 
+@pytest.mark.ci
+@pytest.mark.statistics
 def test_the_smallest_detectable_change_is_found_as_often_as_stated() -> None:
     rng, draws = np.random.default_rng(15), 90
     others = [draw(rng) for _ in range(3)]

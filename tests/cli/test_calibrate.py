@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 import yaml
 
@@ -113,24 +114,34 @@ def test_places_are_in_the_file_in_json_on_the_terminal_and_in_the_report(
     assert json.loads(stdout)["places"] == [[0, 1, 2, 5], [3, 4, 6, 7]]
 
 
-def test_a_failed_calibration_exits_1_and_its_files_are_marked(problem: Path, call: Call) -> None:
-    rig = load_rig(problem / "rig.yaml")
-    nonsense = MatcherErrors(outlier_share=1.0)
-    simulate_correspondences(rig, errors=nonsense).save(problem / "bad.parquet")
-    out = problem / "result"
-    code, _, stderr = call("solve", problem / "rig.yaml", problem / "bad.parquet", "--out", out)
+def test_a_failed_calibration_exits_1_its_files_are_marked_and_its_page_is_written_again(
+    pair: Rig, call: Call, tmp_path: Path
+) -> None:
+    out, nonsense = tmp_path / "out", MatcherErrors(outlier_share=1.0)
+    code, _, stderr = call(*words_to_solve(tmp_path, pair, errors=nonsense))
     assert code == 1
-    assert "FAIL" in stderr
+    assert "FAIL" in stderr and str(out / "report.html") in stderr.replace("\n", "")
     result = load_calibration(out)
     assert result.verdict.status == "FAIL"
     assert [line.split()[1:] for line in stderr.splitlines() if line.startswith(" left->")] == [
         ["-"] * 6
     ]
     content = yaml.safe_load((out / "calibration.yaml").read_text())
+    assert content["verdict"]["status"] == "FAIL"
     assert content["error_bar_holds"]["left->right"] is False
-    export = ("export", out, "--format", "json", "--out", problem / "a.json")
+    metadata = pq.read_schema(out / "correspondences.parquet").metadata
+    assert any(b'"FAIL"' in value for value in metadata.values())
+    export = ("export", out, "--format", "json", "--out", tmp_path / "a.json")
     assert "is FAIL, nothing was written" in error_line(*call(*export))
     assert call(*export, "--even-if-failed")[0] == 0
+    page = (out / "report.html").read_text()
+    assert "FAIL" in page.split("</title>")[0]
+    (out / "report.html").unlink()
+    code, _, stderr = call("report", out)
+    assert code == 0 and "the verdict is FAIL" in stderr
+    assert (out / "report.html").read_text() == page  # the files hold everything on the page
+    assert call("report", out / "calibration.yaml", "--out", tmp_path / "other.html")[0] == 0
+    assert (tmp_path / "other.html").read_text() == page
 
 
 def test_calibrate_writes_a_result_a_report_and_pictures(calibrated_sample: CommandRun) -> None:
@@ -171,19 +182,3 @@ def test_perturb_is_repeatable(problem: Path, call: Call) -> None:
     code, stdout, _ = call("evaluate", problem / "one.yaml", problem / "truth.yaml", "--json")
     for error in json.loads(stdout)["cameras"].values():
         assert error["rotation_error_deg"] == pytest.approx(5)
-
-
-def test_report_writes_the_same_page_again(pair: Rig, call: Call, tmp_path: Path) -> None:
-    nonsense, out = MatcherErrors(outlier_share=1.0), tmp_path / "out"
-    code, _, err = call(*words_to_solve(tmp_path, pair, errors=nonsense))
-    assert code == 1
-    assert str(out / "report.html") in err.replace("\n", "")
-    page = (out / "report.html").read_text()
-    (out / "report.html").unlink()
-    code, _, err = call("report", out)
-    assert code == 0
-    assert "the verdict is FAIL" in err
-    assert (out / "report.html").read_text() == page  # the files hold everything on the page
-    code, _, _ = call("report", out / "calibration.yaml", "--out", tmp_path / "other.html")
-    assert code == 0
-    assert (tmp_path / "other.html").read_text() == page

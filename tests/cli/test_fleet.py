@@ -26,6 +26,10 @@ def test_a_manifest_becomes_rows_and_a_page_and_a_second_call_does_nothing(
     assert "2 vehicles, 4 cameras measured; 0 cameras of 0 vehicles stand apart" in err
     for name in ("fleet.html", "fleet_model.json", "estimates.parquet"):
         assert (Path(out) / name).is_file()
+    with (tmp_path / "in" / "nominal.yaml").open("a") as rig:
+        rig.write("# of another day\n")
+    code, printed, _ = call("fleet", manifest, "--out", out, "--json")
+    assert json.loads(printed)["skipped"] == 0, "the input has changed"
 
 
 def test_failed_jobs_exit_1(call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

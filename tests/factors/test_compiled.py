@@ -104,6 +104,8 @@ def test_with_a_read_only_folder_kernels_are_compiled_in_memory_and_one_line_rep
     assert [*read_only.iterdir()] == []
 
 
+@pytest.mark.ci
+@pytest.mark.slow
 def test_code_that_others_can_write_is_not_loaded(kept: Path, tmp_path: Path) -> None:
     """numba's index is a pickle: this one would make a file."""
     cache, made = tmp_path / "above" / "cache", tmp_path / "made"

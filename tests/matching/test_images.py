@@ -154,7 +154,6 @@ def test_cameras_that_see_the_same_or_nothing_are_not_accused() -> None:
         require_different_images(data, data.rig)
 
 
-@pytest.mark.usefixtures("no_image_checks")
 def test_every_command_names_them(tmp_path: Path, call: Call) -> None:
     data = Path(shutil.copytree(SAMPLE, tmp_path / "data"))
     for path in (data / "cameras/front_left").iterdir():

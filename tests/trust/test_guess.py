@@ -28,23 +28,13 @@ from tests.conftest import SAMPLE, Call, make_camera
 from tests.trust.conftest import named, simulated
 
 RIG = load_rig(SAMPLE)
-
-
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    """A copy of the sample's first frame."""
-    copy = Path(shutil.copytree(SAMPLE, tmp_path / "sample"))
-    for path in (*copy.glob("lidar/*"), *copy.glob("cameras/*/*")):
-        if path.stem > "000000":
-            path.unlink()
-    return copy
+TWO = ("front_left", "left")
 
 
 def with_principal_point(cx: float, cy: float) -> calibgraph.Rig:
     left = RIG.cameras["left"]
     lens = Intrinsics(**{**left.intrinsics_px.model_dump(), "cx": cx, "cy": cy})
-    cameras = {**RIG.cameras, "left": left.model_copy(update={"intrinsics_px": lens})}
-    return RIG.model_copy(update={"cameras": cameras})
+    return Rig(cameras={"left": left.model_copy(update={"intrinsics_px": lens})})
 
 
 def test_the_sample_has_no_warning() -> None:
@@ -52,13 +42,13 @@ def test_the_sample_has_no_warning() -> None:
 
 
 def test_a_rig_whose_cameras_all_see_no_point_is_refused_before_the_search(
-    folder: Path, call: Call
+    tmp_path: Path, call: Call
 ) -> None:
-    for path in (folder / "lidar").iterdir():
-        cloud = np.load(path)
-        cloud[:, :2] *= -1
-        np.save(path, cloud)
-    code, _, err = call("calibrate", folder, "--out", folder / "out")
+    folder = Path(shutil.copytree(SAMPLE, tmp_path / "sample"))
+    cloud = np.load(folder / "lidar" / "000000.npy")
+    np.save(folder / "lidar" / "000000.npy", cloud * [-1, -1, 1, 1])
+    Rig(cameras={name: RIG.cameras[name] for name in TWO}).save(folder / "rig.yaml")
+    code, _, err = call("calibrate", folder, "--frames", "0", "--out", folder / "out")
     assert code == 2
     assert err.count("turned by 180 deg about z (its x points behind, y right, z up)") == 1
     assert "left: by the guess, no point of the cloud lies in the image" in err
@@ -76,10 +66,11 @@ def test_a_camera_of_several_that_sees_no_point_is_a_warning() -> None:
 def test_warnings_are_logged_and_recorded_and_nothing_is_printed(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    data = calibgraph.load_dataset(SAMPLE).select("0:2")
-    table = calibgraph.simulate_correspondences(RIG, frames=2, matches=200, seed=1)
+    rig = with_principal_point(80, 45)
+    data = calibgraph.load_dataset(SAMPLE, rig, frames="0:2")
+    table = calibgraph.simulate_correspondences(rig, frames=2, matches=200, seed=1)
     with caplog.at_level(logging.WARNING, "calibgraph"):
-        result = calibgraph.calibrate(data, with_principal_point(80, 45), table)
+        result = calibgraph.calibrate(data, rig, table)
     assert result.warnings == tuple(caplog.messages)
     assert "principal point (80, 45)" in result.warnings[0]
     assert load_calibration(result.save(tmp_path)).warnings == result.warnings
@@ -197,7 +188,8 @@ def test_a_mistake_is_recognised_by_the_images_at_a_rough_guess(error: str, seed
     rough = rough_guess(seed)
     T = {name: mistaken(error, T) for name, T in rough.T_camera_lidar.items()}
     wrong = rough.moved_to(T)
-    found = likely_intended_guess(one_frame(), wrong)
+    one_frame = calibgraph.load_dataset(SAMPLE, rough, frames="0")  # a mistake is seen in one
+    found = likely_intended_guess(one_frame, wrong)
     assert f"fit clearly better if {in_words(error)}; undo it" in found
     assert f"--correct {error} " in found
     undone = correct_guess(wrong, [error])
@@ -211,7 +203,8 @@ def test_mirrored_images_are_named(tmp_path: Path) -> None:
     shutil.copytree(SAMPLE, copy)
     for path in (copy / "cameras" / "left").iterdir():
         cv2.imwrite(str(path), cv2.flip(cv2.imread(str(path)), 1))
-    found = likely_intended_guess(calibgraph.load_dataset(copy, frames="0"), rough_guess(5))
+    rough = rough_guess(5)
+    found = likely_intended_guess(calibgraph.load_dataset(copy, rough, frames="0"), rough)
     assert found is not None and found.startswith("the images of left are mirrored")
 
 
@@ -222,17 +215,14 @@ def test_no_mistake_is_seen_in_a_guess_that_is_only_rough(
     rotation_deg: float, translation_m: float
 ) -> None:
     rough = rough_guess(6, rotation_deg, translation_m)
-    assert likely_intended_guess(one_frame(), rough) is None
-
-
-def one_frame() -> calibgraph.Dataset:
-    """The first of the sample: a mistake is seen in one already."""
-    return calibgraph.load_dataset(SAMPLE, frames="0")
+    one_frame = calibgraph.load_dataset(SAMPLE, rough, frames="0")
+    assert likely_intended_guess(one_frame, rough) is None
 
 
 def rough_guess(seed: int, rotation_deg: float = 4.0, translation_m: float = 0.3) -> calibgraph.Rig:
-    """The sample's rig, some way off."""
-    truth = calibgraph.load_rig(SAMPLE / "reference.yaml")
+    """Two cameras of the sample, some way off."""
+    whole = calibgraph.load_rig(SAMPLE / "reference.yaml")
+    truth = Rig(cameras={name: whole.cameras[name] for name in TWO})
     return calibgraph.perturb(
         truth, rotation_deg=rotation_deg, translation_m=translation_m, seed=seed
     )

@@ -55,8 +55,8 @@ def measure(camera: Camera) -> tuple[LensParameter, ...]:
     [
         (FOCAL, 0.03, "focal length"),
         (RADIAL, -0.1, "distortion"),
-        (CENTRE_X, 0.04, "principal point"),
-        (ASPECT, 0.06, "aspect ratio"),
+        pytest.param(CENTRE_X, 0.04, "principal point", marks=pytest.mark.slow),
+        pytest.param(ASPECT, 0.06, "aspect ratio", marks=pytest.mark.slow),
     ],
 )
 def test_a_wrong_lens_is_named_and_measured(

@@ -138,6 +138,7 @@ def truth() -> Rig:
     return calibgraph.load_rig(SAMPLE / "reference.yaml")
 
 
+@pytest.mark.usefixtures("no_image_checks")
 @pytest.mark.parametrize(("deg", "status"), [(0.0, "PASS"), (1.0, "FAIL")])
 def test_a_matcher_that_comes_back_passes_and_one_that_ends_elsewhere_fails(
     truth: Rig, deg: float, status: str
@@ -149,6 +150,7 @@ def test_a_matcher_that_comes_back_passes_and_one_that_ends_elsewhere_fails(
         assert checks[0].value == pytest.approx(deg, abs=0.02)
 
 
+@pytest.mark.usefixtures("no_image_checks")
 def test_a_camera_is_taken_from_where_image_and_cloud_agree_clearly_better(truth: Rig) -> None:
     """All cameras end 8 cm off at first; only of one is the second end clearly better."""
     off = calibgraph.perturb(truth, rotation_deg=0.1, translation_m=0.08, seed=1)

@@ -45,7 +45,7 @@ def test_an_inverted_guess_is_named_also_when_the_time_is_over() -> None:
     one = Rig(cameras={"front_left": truth.cameras["front_left"]})
     inverted = one.moved_to({"front_left": np.linalg.inv(one.T_camera_lidar["front_left"])})
     nonsense = simulate_correspondences(one, frames=6, errors=MatcherErrors(outlier_share=1.0))
-    data = calibgraph.load_dataset(SAMPLE, inverted, frames="0:2")
+    data = calibgraph.load_dataset(SAMPLE, inverted, frames="0")
     result = calibgraph.calibrate(data, matcher=nonsense, time_limit_s=1e-3)
     (check,) = named(result, "front_left", "convention of the guess")
     assert check.status == "FAIL" and "inverted (it is T_lidar_camera)" in check.text

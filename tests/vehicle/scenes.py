@@ -85,6 +85,7 @@ def scan(boxes: Array, T_road_lidar: Array, rng: np.random.Generator, *, beams: 
 def record(
     seed: int, *, places: int = 4, mounts: Mapping[str, Array] = MOUNTS, street: bool = False,
     moved: Mapping[str, Array] | None = None, scatter: tuple[float, float] = (0.0, 0.0),
+    beams: int = 20,
 ) -> dict[str, list[Array]]:  # fmt: skip
     """Clouds of each LiDAR at each place; of places from the half on, LiDARs stand as ``moved``.
 
@@ -108,5 +109,5 @@ def record(
                     Rotation.from_rotvec(rng.normal(0, scatter[0], 3)).as_matrix() @ T[:3, :3]
                 )
                 here[:3, 3] += rng.normal(0, scatter[1], 3)
-            clouds[name].append(scan(boxes, at @ here, rng))
+            clouds[name].append(scan(boxes, at @ here, rng, beams=beams))
     return clouds

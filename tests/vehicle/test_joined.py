@@ -29,6 +29,8 @@ from calibgraph.matching.named import find_matcher
 from calibgraph.model.config import Config
 from calibgraph.model.geometry import invert, move_points, retract_all, transform, twist_between
 from calibgraph.model.rig import Lidar
+from calibgraph.pipeline import find_lidars
+from calibgraph.progress import no_progress
 from calibgraph.vehicle.joined import (
     join_clouds,
     joint_covariance,
@@ -171,11 +173,9 @@ def test_solved_tables_keep_what_lidars_add(
         assert "poses of other LiDARs" in wider.error_sources[name].rotation
 
 
-def calibrations(rig: Rig, T: Sequence[Array], errors: Array) -> list[Calibration]:
+def calibrations(done: Calibration, T: Sequence[Array], errors: Array) -> list[Calibration]:
     """Of all cameras to the base, and to another LiDAR; with errors (2, N, 6) of variance one."""
-    table = simulate_correspondences(rig, frames=6, matches=60, errors=None)
-    done = calibgraph.solve(rig, table)
-    found = []
+    rig, found = done.initial_rig, []
     for own, error in zip(T, errors, strict=True):
         at = {n: c.T_camera_lidar @ own for n, c in rig.cameras.items()}
         off = retract_all(np.array([*at.values()]), 1e-3 * error)
@@ -203,8 +203,9 @@ def test_cameras_place_a_lidar_with_the_error_bar_of_both_sides():
     data = replace(data, frames=frames)
     at = rig.model_copy(update={"lidars": None})
     seen = Rig(cameras={n: at.cameras[n] for n in [*at.cameras][:2]})
+    done = calibgraph.solve(seen, simulate_correspondences(seen, frames=6, matches=60, errors=None))
     ready = [
-        calibrations(seen, [np.eye(4), T_TOP_LOW], rng.normal(size=(2, 2, 6))) for _ in range(40)
+        calibrations(done, [np.eye(4), T_TOP_LOW], rng.normal(size=(2, 2, 6))) for _ in range(40)
     ]
     for of in map(iter, ready):
         with pytest.MonkeyPatch.context() as patch:
@@ -292,10 +293,7 @@ def test_cameras_that_the_base_does_not_show_are_calibrated_to_all_lidars(
         assert table.counts() == result.correspondences.counts()
 
 
-@pytest.mark.parametrize("kind", ["file", "table", "matcher"])
-def test_tables_place_no_lidar_and_join_no_clouds(
-    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_tables_place_no_lidar_and_join_no_clouds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Their points are of one LiDAR: both sides would be the same."""
     data = split_sample(tmp_path, 10.0, 10.0)
     table, asked = simulate_correspondences(data.rig, frames=6, matches=50), []
@@ -306,10 +304,10 @@ def test_tables_place_no_lidar_and_join_no_clouds(
 
     monkeypatch.setattr("calibgraph.pipeline.calibrate_rig_lidars", found)
     table.save(tmp_path / "table.parquet")
-    given = {"file": tmp_path / "table.parquet", "table": table, "matcher": find_matcher(table)}
-    result = calibgraph.calibrate(data, matcher=given[kind])
-    assert asked == [None]
-    assert not any("joined" in line for line in result.warnings)
+    for matcher in (tmp_path / "table.parquet", table, find_matcher(table)):
+        same, _, joined = find_lidars(data, data.rig, matcher, Config(), progress=no_progress)
+        assert same is data and joined == ""
+    assert asked == [None, None, None]
 
 
 def test_clouds_are_joined_only_where_cameras_gain(tmp_path: Path):

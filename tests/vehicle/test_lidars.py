@@ -49,6 +49,7 @@ def sigmas(found: LidarPoses, name: str) -> Array:
     return np.sqrt(np.diag(found.covariance[name]))
 
 
+@pytest.mark.usefixtures("few_placements")
 def test_poses_are_found_without_a_guess_upside_down_too():
     clouds = record(1, places=2, mounts={"top": MOUNTS["top"], "down": UPSIDE_DOWN})
     start, doubts, _ = locate_lidars(look(clouds), {"down": None}, base="top")
@@ -59,16 +60,6 @@ def test_poses_are_found_without_a_guess_upside_down_too():
     assert off[:3].max() < np.radians(0.02) and off[3:].max() < 0.004
     assert (off < 3 * sigmas(found, "down")).all()
     assert found.matched["down"] > 0.95
-
-
-def test_a_start_20_degrees_off_ends_where_a_near_one_does():
-    clouds, ends = record(2, places=1, mounts=TWO), []
-    for deg, metres in ((20.0, 0.5), (1.0, 0.05)):
-        guess = {"left": displaced(MOUNTS["left"], 3, deg, metres)}
-        start = locate_lidars(look(clouds), guess, base="top")[0] if deg > 5 else guess
-        ends.append(calibrate_lidars(look(clouds), start, base="top").T_base_lidar["left"])
-    # both stop at steps of 1e-6, about one optimum
-    np.testing.assert_allclose(*ends, atol=1e-4)
 
 
 def test_what_a_lidar_adds_to_ranges_widens_the_bar_where_it_looks_one_way():
@@ -86,7 +77,7 @@ def test_what_a_lidar_adds_to_ranges_widens_the_bar_where_it_looks_one_way():
 
 
 def test_a_flat_street_leaves_the_direction_along_it_open():
-    clouds = record(3, places=1, street=True)
+    clouds = record(3, places=1, beams=12, street=True)
     guess = {name: displaced(MOUNTS[name], 4, 0.5, 0.05) for name in ("front", "left")}
     found = calibrate_lidars(look(clouds), guess, base="top")
     for name in ("front", "left"):
@@ -153,7 +144,7 @@ def test_places_that_differ_widen_the_error_bar_and_places_that_agree_narrow_it(
     turn, shift = PLACE_SIGMAS[0], PLACE_SIGMAS[3]
     ratios = {}
     for factor in (0.0, 2.0):
-        clouds = record(5, places=3, mounts=TWO, scatter=(factor * turn, factor * shift))
+        clouds = record(5, places=3, mounts=TWO, beams=12, scatter=(factor * turn, factor * shift))
         found = calibrate_lidars(look(clouds), TWO, base="top")
         ratios[factor] = found.place_ratios
         off = np.abs(errors(found, "left", MOUNTS["left"]))
@@ -165,23 +156,26 @@ def test_places_that_differ_widen_the_error_bar_and_places_that_agree_narrow_it(
 def test_instants_in_which_the_vehicle_stands_count_once():
     rng, boxes = np.random.default_rng(9), draw_place(np.random.default_rng(1))
     ats = [transform(np.eye(3), [x, 0.0, HEIGHT_M]) for x in (0.0, 0.0, 5.0, 0.0)]
-    clouds = {n: [scan(boxes, at @ MOUNTS[n], rng) for at in ats] for n in ("top", "front")}
+    clouds = {
+        n: [scan(boxes, at @ MOUNTS[n], rng, beams=12) for at in ats] for n in ("top", "front")
+    }
     assert calibrate_lidars(look(clouds), MOUNTS, base="top").places == 2
 
 
 def test_a_lidar_that_moved_between_places_shows_in_what_places_differ_by():
     T = MOUNTS["left"].copy()
     T[1, 3] += 0.15
-    clouds = record(6, places=2, mounts=TWO, moved={"left": T})
+    clouds = record(6, places=2, mounts=TWO, beams=12, moved={"left": T})
     found = calibrate_lidars(look(clouds), TWO, base="top")
     assert found.place_ratios[1] > 2.0**2  # the limit of PASS, as a variance
 
 
+@pytest.mark.usefixtures("few_placements")
 def test_clouds_that_share_nothing_are_refused_with_their_share():
-    clouds, rng = record(7, places=1), np.random.default_rng(8)
+    clouds, rng = record(7, places=1, beams=12), np.random.default_rng(8)
     elsewhere = draw_place(rng, boxes=6, fronts=False)
     at = transform(np.eye(3), [0.0, 0.0, HEIGHT_M])
-    clouds["left"] = [scan(elsewhere, at @ MOUNTS["left"], rng)]
+    clouds["left"] = [scan(elsewhere, at @ MOUNTS["left"], rng, beams=12)]
     found, _, lost = locate_lidars(look(clouds), {"front": None, "left": None}, base="top")
     assert [*found] == ["front"] and re.match(r"LiDAR 'left' shares too little with top.*%", lost)
     clouds["left"] = [np.array([[5.0, y, z] for y in range(9) for z in range(9)])]
@@ -191,6 +185,7 @@ def test_clouds_that_share_nothing_are_refused_with_their_share():
         calibrate_lidars(look(clouds), MOUNTS, base="top")
 
 
+@pytest.mark.usefixtures("few_placements")
 def test_a_lidar_without_ground_near_it_is_placed_by_its_guess():
     clouds = record(2, places=1, mounts=TWO)
     clouds["top"] = [of[np.linalg.norm(of, axis=1) > 15.0] for of in clouds["top"]]

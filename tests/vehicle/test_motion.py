@@ -15,6 +15,8 @@ from calibgraph.model.geometry import invert, move_points, transform
 from factors import displace
 from tests.vehicle.scenes import ALL_AROUND_DEG, HEIGHT_M, MOUNTS, draw_place, scan
 
+pytestmark = pytest.mark.usefixtures("few_placements")
+
 START_NS, SLICES, SCAN_S = 1_700_000_000_000_000_000, 12, 0.1
 LATE_S = {"top": 0.0, "front": 0.03}  # the begin of its scan after the instant's stamp
 
@@ -33,7 +35,7 @@ def sweep(boxes: Array, lidar: str, speed_m_s: float, rng: np.random.Generator, 
     for number, azimuths_deg in enumerate(np.split(ALL_AROUND_DEG, SLICES)):
         seconds = LATE_S[lidar] + SCAN_S * (number + 0.5) / SLICES
         T_road_lidar = pose_at(from_s + seconds, speed_m_s) @ MOUNTS[lidar]
-        points = scan(boxes, T_road_lidar, rng, azimuths_deg=azimuths_deg)
+        points = scan(boxes, T_road_lidar, rng, beams=12, azimuths_deg=azimuths_deg)
         parts += [(*point, round(1e9 * seconds)) for point in points.tolist()]
     return np.array(parts, dtype=[("x", "f4"), ("y", "f4"), ("z", "f4"), ("t", "u4")])
 
@@ -208,7 +210,7 @@ def test_lidars_that_share_nothing_are_joined_by_motion(tmp_path, caplog):
 
 
 def test_lidars_that_share_nothing_are_refused_where_the_motion_is_unknown(tmp_path):
-    folder = write_street(tmp_path, 4.5)
+    folder = write_street(tmp_path, 3.0)
     message = r"'behind' shares too little with ahead: .*%.* or drive 150 m past walls, with times"
     with pytest.raises(CalibrationError, match=message):
         calibgraph.calibrate(folder)

@@ -61,7 +61,6 @@ def write_mcap(
     messages: list[Stamped],
     *,
     kind: str = "mcap",
-    profile: str = "ros2",
     beside: str = "",
     **options: Any,
 ) -> Path:
@@ -71,7 +70,6 @@ def write_mcap(
         path: of the file.
         messages: in any order.
         kind: ros1, or mcap for those of ROS 2.
-        profile: of the header.
         beside: the encoding of a further channel.
         options: of the writer.
     """
@@ -79,7 +77,7 @@ def write_mcap(
     store = STORES[ros1]
     with path.open("wb") as file:
         writer = Writer(file, **{"chunk_size": 200_000, **options})
-        writer.start(profile, "test")
+        writer.start("ros2", "test")
         if beside:
             number = writer.register_schema("foxglove.Notes", f"{beside}schema", b"{}")
             notes = writer.register_channel("/notes", beside, number)
@@ -358,6 +356,8 @@ for path in sys.argv[1:]:
 """
 
 
+@pytest.mark.ci
+@pytest.mark.slow
 def test_a_bomb_is_one_line_in_little_time_and_memory(tmp_path: Path) -> None:
     paths = []
     for name, (make, _) in BOMBS.items():

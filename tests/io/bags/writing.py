@@ -3,6 +3,7 @@
 from collections.abc import Iterable
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 
 from calibgraph import Camera, Dataset, Rig, load_dataset
 from calibgraph.io.bags.messages import type_store
+from calibgraph.io.dataset import keep_frames
 from calibgraph.model.geometry import invert, transform
 from tests.conftest import SAMPLE
 
@@ -197,6 +199,9 @@ def tree_of(rig: Rig) -> list[tuple[str, str, NDArray[np.float64]]]:
     return edges
 
 
+_sample = cache(lambda: keep_frames(load_dataset(SAMPLE)))
+
+
 def sample_messages(
     make: Messages, data: Dataset | None = None, *, raw: bool = False
 ) -> list[Stamped]:
@@ -207,7 +212,7 @@ def sample_messages(
         data: whose frames are 0.1 s apart.
         raw: images as pixels, not as the files' JPEG.
     """
-    data = data or load_dataset(SAMPLE)
+    data = data or _sample()
     tree = make.transforms(tree_of(data.rig))
     written = [Stamped("/tf_static", "tf2_msgs/msg/TFMessage", START_NS, tree)]
     for name, camera in data.rig.cameras.items():

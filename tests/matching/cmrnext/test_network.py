@@ -82,6 +82,8 @@ def test_network_computes_its_description(architecture: Architecture) -> None:
     np.testing.assert_allclose(flow, FLOWS[architecture], atol=2e-4, rtol=0)
 
 
+@pytest.mark.ci
+@pytest.mark.realdata
 def test_published_test_vectors_are_reproduced(reference_folder: Path) -> None:
     """Encoders and lookup to 1e-6 relative, flow to 1e-3 px."""
     vectors = np.load(reference_folder / "cmrnext_golden.npz", allow_pickle=False)

@@ -1,7 +1,6 @@
 """The matcher `structure` on the sample; from its own guess, as a user calls it: test_docs.py."""
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -140,16 +139,17 @@ def test_the_number_of_threads_does_not_matter(truth: Rig, monkeypatch: pytest.M
 
 @pytest.mark.usefixtures("no_image_checks")
 def test_a_camera_that_sees_none_of_the_cloud_is_named(truth: Rig) -> None:
-    T = dict(truth.T_camera_lidar)
-    T["left"] = np.diag([-1.0, 1.0, -1.0, 1.0]) @ T["left"]
-    data = replace(calibgraph.load_dataset(SAMPLE).select("0"), rig=truth.moved_to(T))
+    two = Rig(cameras={name: truth.cameras[name] for name in ("front_left", "left")})
+    away = np.diag([-1.0, 1.0, -1.0, 1.0]) @ truth.T_camera_lidar["left"]
+    data = calibgraph.load_dataset(SAMPLE, two.moved_to({"left": away}), frames="0")
     result = calibgraph.calibrate(data, matcher=without_search(LEVELS[-2:]))
     (check,) = (c for c in result.camera_verdicts["left"].checks if c.name == "correspondences")
     assert check.status == "FAIL" and "the cloud lies where T_camera_lidar looks" in check.text
 
 
 def test_a_result_of_fewer_rounds_is_partial() -> None:
-    data = calibgraph.load_dataset(SAMPLE).select("0:2")
+    one = Rig(cameras={"left": calibgraph.load_rig(SAMPLE).cameras["left"]})
+    data = calibgraph.load_dataset(SAMPLE, one, frames="0:2")
     result = calibgraph.calibrate(data, matcher=without_search(LEVELS[:3]), time_limit_s=1e-3)
     assert len(result.rounds) == 1
     assert result.verdict.status in ("WARN", "FAIL")
