@@ -10,7 +10,7 @@ starts from. With ``cmrnext`` and with tables of correspondences, Stage 1 is the
 """
 
 import logging
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -21,13 +21,14 @@ import numpy as np
 from calibgraph.arrays import Array
 from calibgraph.io.clouds import describe_thinned
 from calibgraph.io.dataset import Dataset, load_dataset
+from calibgraph.io.rigs import load_rig
 from calibgraph.io.tables import load_correspondences
 from calibgraph.matching.named import is_table
 from calibgraph.matching.run import MatchingRun
 from calibgraph.model.calibration import Calibration, Later
 from calibgraph.model.camera_matches import CameraMatches
 from calibgraph.model.clock import odd_motions, unused_times
-from calibgraph.model.config import Config, Terms
+from calibgraph.model.config import Config, Terms, config_from
 from calibgraph.model.correspondences import Correspondences
 from calibgraph.model.lens import with_sigmas
 from calibgraph.model.rig import Lidar, Rig
@@ -57,9 +58,9 @@ _log = logging.getLogger(__name__)
 @with_own_threads
 def calibrate(
     dataset: Datasets,
-    rig: Rig | None = None,
+    rig: Rig | Path | str | None = None,
     matcher: AnyMatcher = "structure",
-    config: Config | None = None,
+    config: Config | Mapping[str, Any] | None = None,
     *,
     terms: Terms = "full",
     time_limit_s: float | None = None,
@@ -72,9 +73,9 @@ def calibrate(
 
     Args:
         dataset: a dataset, its folder, a KITTI odometry sequence, or several folders of one rig.
-        rig: the initial guess; the rig that lies with the data if None.
+        rig: the initial guess, or its file; the rig that lies with the data if None.
         matcher: ``structure``; a matcher of your own; or correspondences, from a file or in memory.
-        config: settings of the solve; the preset ``auto`` if None.
+        config: settings of the solve, or a mapping of them; the preset ``auto`` if None.
         terms: of the objective, see :func:`calibgraph.solve`.
         time_limit_s: when to stop matching; the result is then marked as partial.
         progress: called as the work goes on.
@@ -87,7 +88,8 @@ def calibrate(
         CorrespondenceError: if a camera gets too few correspondences.
         ValueError: if the matcher is unknown.
     """
-    config, report = config or Config(), progress or no_progress
+    rig = load_rig(rig) if isinstance(rig, (Path, str)) else rig
+    config, report = _config_of(config), progress or no_progress
     data = dataset if isinstance(dataset, Dataset) else load_dataset(dataset, rig)
     rig = rig if rig and data is dataset else data.rig
     data = data.at_instants() if config.instant_clouds else data
@@ -104,6 +106,10 @@ def calibrate(
             result, by_lidars = _without_cameras(data, rig, config, terms), np.empty((0, 0))
     result = replace(result, timings_s={**watch.seconds, **result.timings_s})
     return _with_lidars(result, lidars, by_lidars, joined)
+
+
+def _config_of(config: Config | Mapping[str, Any] | None) -> Config:
+    return config_from(config, "config") if isinstance(config, Mapping) else config or Config()
 
 
 def _finish(run: MatchingRun) -> tuple[Calibration, Array]:
@@ -188,9 +194,9 @@ def _with_lidars(
 
 @with_own_threads
 def solve(
-    rig: Rig,
+    rig: Rig | Path | str,
     table: Correspondences | Path | str,
-    config: Config | None = None,
+    config: Config | Mapping[str, Any] | None = None,
     terms: Terms = "full",
     *,
     camera_matches: CameraMatches | None = None,
@@ -198,9 +204,9 @@ def solve(
     """Calibrate all cameras of a rig jointly from correspondences.
 
     Args:
-        rig: cameras with their initial guess, and independently known relative poses.
+        rig: cameras with their initial guess, and independently known relative poses; or its file.
         table: correspondences, their points in the LiDAR frame; or their file.
-        config: settings; the preset ``auto`` if None.
+        config: settings, or a mapping of them; the preset ``auto`` if None.
         terms: ``full``; ``reprojection`` (lambda = mu = 0); ``priors`` (no reprojection term);
             ``stage1`` (the aggregated per-frame PnP). The rig's ``relative_poses`` are
             measurements and take part in all but ``stage1``.
@@ -217,6 +223,7 @@ def solve(
         ValueError: if ``terms`` is unknown.
     """
     table = table if isinstance(table, Correspondences) else load_correspondences(table)
+    rig, config = load_rig(rig) if isinstance(rig, (Path, str)) else rig, _config_of(config)
     solution = solve_joint(rig, table, config, terms, camera_matches=camera_matches)
     record = ImageRecord.from_metadata(solution.correspondences.metadata)
     watch = Stopwatch()

@@ -15,6 +15,7 @@ from calibgraph import (
     Calibration,
     Config,
     Correspondences,
+    FileError,
     MatcherErrors,
     Rig,
     perturb,
@@ -145,6 +146,19 @@ def test_the_saved_table_solved_again_gives_the_saved_result(
     assert saved.counts["front_left"]["places"] > 1
     for name, sigmas in ((n, saved.sigmas(n)) for n in saved.rig.cameras):
         assert (sigmas is None) == (case == "excluded camera" and name == "left")
+
+
+def test_a_rig_is_taken_by_its_path_and_settings_as_a_mapping(guess, truth, tmp_path):
+    guess.save(tmp_path / "rig.yaml")
+    table, rig = table_of(truth), str(tmp_path / "rig.yaml")
+    one = calibgraph.solve(guess, table, preset("kitti"))
+    two = calibgraph.solve(rig, table, {"preset": "kitti"})
+    np.testing.assert_array_equal(one.T_camera_lidar["left"], two.T_camera_lidar["left"])
+    assert one.config == two.config
+    with pytest.raises(FileError, match="tau"):
+        calibgraph.solve(rig, table, {"tau": 1})
+    with pytest.raises(FileError, match="tau"):
+        calibgraph.calibrate(tmp_path, rig, config={"tau": 1})
 
 
 def test_places_of_the_table_count_in_the_solve(guess: Rig, truth: Rig) -> None:
