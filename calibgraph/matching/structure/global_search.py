@@ -72,6 +72,8 @@ class Locator:
             best = max(range(len(tried)), key=lambda k: tried[k].z_score)
             self._bodies[name], self._near[name] = guesses[best], tried[best]
             self._consider(name, tried[best], TRIES[1])
+        shown = self._search.shows_something  # of the others, there is nothing to find
+        self._bodies = {name: body for name, body in self._bodies.items() if shown(body)}
         steps = (
             self._propose,
             self._search_next,

@@ -83,6 +83,10 @@ class PoseSearch:
     def _common(self) -> CommonFeatures:
         return CommonFeatures(self.rig, self._frames, seed=self._seed)
 
+    def shows_something(self, body: Body) -> bool:
+        """Whether any image of the body does."""
+        return any(gray.shows_something for name in body for gray in self._frames[name].grays)
+
     def near(self, body: Body) -> Candidate:
         """Refine the body from its guess, and from the best pose of a coarse approach."""
         direct = refine(self._frames, body)
@@ -183,7 +187,7 @@ class PoseSearch:
             self.rig, frames, self._range, seed=self._seed, out_of_time=self.out_of_time
         )
         evidence = []
-        for body in rigid_bodies(self.rig):
+        for body in filter(self.shows_something, rigid_bodies(self.rig)):
             self.report(f"searching mirrored images: {next(iter(body))}")
             found = search.with_roll(body, ROLLS_RAD[0], effort=1)
             if math.isfinite(found.z_score):

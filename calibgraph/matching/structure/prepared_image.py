@@ -22,6 +22,7 @@ Derived = KeyedCache[tuple[Hashable, ...], Any]
 
 FINEST_RAD = np.radians(0.03)
 """Of a pixel; half the finest step. Images of 20 megapixels keep a quarter of their pixels."""
+_PARTS, _NOISE = (16, 16), 2  # of an image, and gray levels between means of parts
 LOG_GRAY = np.log1p(np.arange(256, dtype=np.float32))
 
 
@@ -65,6 +66,12 @@ class PreparedImage:
             return pad(np.asarray(cv2.GaussianBlur(small, (0, 0), blur_steps)))
 
         return self.derived.get((self.identity, *size, blur_steps), scale), np.divide(size, whole)
+
+    @property
+    def shows_something(self) -> bool:
+        """Whether its parts differ by more than noise, as those of a covered lens do not."""
+        parts = cv2.resize(self.gray, _PARTS, interpolation=cv2.INTER_AREA)
+        return int(np.ptp(parts)) > _NOISE
 
     def mirrored(self) -> PreparedImage:
         """The image with its left and right swapped."""

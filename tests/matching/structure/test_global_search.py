@@ -20,6 +20,7 @@ from calibgraph.matching.structure.pose_search import (
     PROMISING,
     PoseSearch,
 )
+from calibgraph.matching.structure.prepared_image import PreparedImage
 from calibgraph.progress import no_progress
 from tests.conftest import stereo_relative_pose
 from tests.matching.structure.data import never
@@ -43,6 +44,7 @@ class MadeUp(PoseSearch):
         z_scores: T_camera_lidar of a lead, and its z-score.
         searched: what the searches for a camera find, in turn; the last one again and again.
         sees: per (other camera, camera): where the other, at its first pose, sees the camera.
+        blank: cameras whose images show nothing.
     """
 
     def __init__(
@@ -51,10 +53,15 @@ class MadeUp(PoseSearch):
         z_scores: Iterable[tuple[np.ndarray, float]],
         searched: Mapping[str, list[np.ndarray]] | None = None,
         sees: Mapping[tuple[str, str], tuple[np.ndarray, np.ndarray]] | None = None,
+        blank: tuple[str, ...] = (),
     ) -> None:
         super().__init__(rig, {}, (0.3, 1.5), seed=0, out_of_time=never)
         self.z_scores, self.found, self.sees = list(z_scores), dict(searched or {}), sees or {}
         self.searches: list[str] = []
+        self.blank = blank
+
+    def shows_something(self, body: Body) -> bool:
+        return not {*body} <= {*self.blank}
 
     def at(self, body: Body) -> Candidate:
         T = lead(body).T_camera_lidar
@@ -81,6 +88,20 @@ class MadeUp(PoseSearch):
 def locate(search: PoseSearch) -> Found:
     with ThreadPoolExecutor(1) as pool:
         return Locator(search, pool, no_progress).locate()
+
+
+def test_a_camera_whose_images_show_nothing_is_missed_without_a_search(two: Rig) -> None:
+    search = MadeUp(two, [], blank=NAMES[1:])
+    _, findings = locate(search)
+    assert {*search.searches} == {NAMES[0]}
+    assert findings.missed.keys() == {*NAMES}
+
+
+def test_noise_on_a_covered_lens_is_nothing_to_see() -> None:
+    noise = np.random.default_rng(0).normal(4, 3, (240, 320)).clip(0, 255)
+    faint = noise + np.linspace(0, 8, 320)
+    seen = [PreparedImage(gray.astype(np.uint8)).shows_something for gray in (noise, faint)]
+    assert seen == [False, True]
 
 
 @pytest.fixture
