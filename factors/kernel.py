@@ -481,7 +481,12 @@ def differentiate_pinhole(lens, n, tile):  # type: ignore[no-untyped-def]
     fx, fy, k1, k2, p1, p2, k3, k4, k5, k6 = (
         lens[0], lens[1], lens[4], lens[5], lens[6], lens[7], lens[8], lens[9], lens[10], lens[11],
     )  # fmt: skip
-    for i in range(n):
+    undistorted = math.isinf(lens[LIMIT])
+    for i in range(n if undistorted else 0):
+        w = 1.0 / rz[i]
+        ux[i], uy[i], uz[i] = fx * w, 0.0, -fx * rx[i] * w * w
+        vx[i], vy[i], vz[i] = 0.0, fy * w, -fy * ry[i] * w * w
+    for i in range(0 if undistorted else n):
         w = 1.0 / rz[i]
         a, b = rx[i] * w, ry[i] * w
         _, _, by_a, cross, _, by_b = distort(a, b, k1, k2, p1, p2, k3, k4, k5, k6)
