@@ -71,7 +71,7 @@ NO_FREE = read_only(np.empty(0, np.int64)), NO_STEP, read_only(np.empty((0, 3, 0
 _NO_WHITENING = read_only(np.empty((0, 0)))
 _NO_FLAGS = np.empty(0, np.bool_)
 ON_AXIS = 1e-20  # squared sine of a field angle
-MIN_RANGE_M = 1e-9
+MIN_RANGE_M = 1e-9  # what divides a point of the unified model
 _SMALL = 1e-100  # far from the smallest float by more than four factors
 
 
@@ -449,7 +449,7 @@ def project_others(kind, lens, columns, start, n, tile):  # type: ignore[no-unty
             tile[VX, i], tile[VY, i], tile[VZ, i] = vx, vy, vz
 
 
-# Without branches, the three below hold in the lens' domain; they mark other points as such.
+# The projections below have no branches, hold in the lens' domain, and mark other points.
 @compiled(part=True, fastmath=FAST)
 def project_pinhole(lens, columns, start, n, tile):  # type: ignore[no-untyped-def]
     """Residuals of a pinhole; False, if there are other points."""

@@ -116,7 +116,7 @@ class CameraBlock:
         """Norms of the residuals over the median of a standard Gaussian's.
 
         The median of Gaussian ones of one standard deviation per axis is that standard deviation.
-        Those of all at one pose are kept: scale, gate and checks ask for them one after the other.
+        Sizes of all matches at one pose are kept: scale, gate and checks ask for them in turn.
 
         Args:
             T_camera_lidar: (1, 4, 4), or (r, 4, 4) with one of each run.
@@ -129,7 +129,7 @@ class CameraBlock:
         place, last = T_camera_lidar.tobytes(), self.__dict__.get("_last_sizes")
         if runs is not None or last is None or last[0] != place:
             last = place, self._sizes(T_camera_lidar, runs)
-        if runs is None:  # replaced as one, so that threads never see those of another pose
+        if runs is None:  # in one step: no thread sees sizes of another pose
             self.__dict__["_last_sizes"] = last
         return last[1]
 

@@ -98,10 +98,15 @@ def sums_of(state: State, gated: Mapping[int, Gated]) -> Sums:
     if not np.array_equal(poses, to):
         steps = logarithms(poses @ invert(to))
         gradient = gradient + (hessian @ steps[..., None])[..., 0]
-    scatter, frames = gradient[:, :, None] * gradient[:, None, :], len(cameras)
-    matches = np.concatenate([own.counts for own in gated.values()])
-    values = hessian, here.hessian, scatter, gradient, gradient, np.ones(frames), matches
-    return Sums(np.concatenate([each.reshape(frames, -1) for each in values], axis=1))
+    return Sums.zeros(len(cameras)).change(
+        hessian=hessian,
+        gradient=gradient,
+        reweighted=here.hessian,
+        score=gradient,
+        scatter=gradient[:, :, None] * gradient[:, None, :],
+        frames=np.ones(len(cameras)),
+        matches=np.concatenate([own.counts for own in gated.values()]),
+    )
 
 
 def add_to_totals(state: State, frames: Sums) -> None:

@@ -477,8 +477,10 @@ def locate_places(state: State, graph: EpochGraph) -> None:
 def _fit(state: State, terms: Terms, window: Window) -> tuple[Eliminated, Array]:
     """Find where matches show the cameras, at all places and at each, and the weights of these.
 
-    In a robust loss those of new places start from 1. The places are left eliminated, with the
-    squared sigmas of their displacements.
+    In a robust loss, weights of new places start from 1.
+
+    Returns:
+        The places, eliminated; (P, 1 + n) their displacements, in squared sigmas.
     """
     weights = terms.known_weights(state)
     for _ in range(_MOST_WEIGHINGS):

@@ -53,7 +53,7 @@ def offset_checks(evidence: Evidence) -> Found:
     """The offset of each camera by the matches of a table that comes with the LiDAR's motion."""
     solution, config = evidence.solution, evidence.solution.config
     table, variance = solution.correspondences, evidence.findings.place_variance
-    if table.twist_per_s is None or not {*CLOCK}.isdisjoint(config.estimate):
+    if not {*CLOCK}.isdisjoint(config.estimate):
         return
     for name, fit in _fit_cameras(solution.solved_rig, table, variance):
         yield name, check_offset(fit, RESIDUALS, config.tolerance)
@@ -108,7 +108,7 @@ def _motion_options(dataset: Dataset) -> str:
 def _fit_cameras(
     rig: Rig, table: Correspondences, place_variance: float
 ) -> Iterator[tuple[str, LensParameter]]:
-    for name, camera in rig.cameras.items():
+    for name, camera in rig.cameras.items() if table.twist_per_s is not None else ():
         if fit := fit_offset(camera, table.of_camera(name), place_variance):
             yield name, fit
 
@@ -133,7 +133,7 @@ def fit_offset(
 
     ``place_variance`` is what the matches of a place share, over that of independent ones.
     """
-    if table.twist_per_s is None or len(np.unique(table.frame)) < MIN_FRAMES:
+    if len(np.unique(table.frame)) < MIN_FRAMES:
         return None
     sigma_s = camera.time_offset_sigma_s or LensSigmas.calibrated(camera).offset_s
     free = Columns(camera.lens, (OFFSET,), (sigma_s,), clock_of(camera))

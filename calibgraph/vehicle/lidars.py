@@ -54,7 +54,7 @@ GUESS_SIGMAS = np.repeat([np.radians(10.0), 1.0], 3)
 """(6,) [rad, m] of a direction that no plane determines."""
 RANGE_SIGMA_M = 0.01
 """Standard deviation of what a LiDAR adds to all its ranges: data sheets state 1 to 3 cm."""
-_SAME_OFFSET_M, _MOST_OFFSETS = 0.002, 4  # of it: what is as good, and rounds
+_SAME_OFFSET_M, _MOST_OFFSETS = 0.002, 4  # a change of it that ends the rounds, and most rounds
 _EXACT = 1e-18  # [m^2, rad^2] least variance, for rounding
 _LEAST_VARIANCE = 1e-9  # [m^2] of residuals: without, exact scans determine more than numbers hold
 _SETTLED, _MOST_STEPS = 0.01, 50  # of REML

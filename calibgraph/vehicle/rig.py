@@ -364,8 +364,8 @@ def _unequal_ranges(poses: LidarPoses) -> list[str]:
     """A line per LiDAR that measures longer or shorter ranges than the base."""
     return [
         f"{name} measures {100 * abs(longer_m):.1f} cm {'longer' if longer_m > 0 else 'shorter'} "
-        f"ranges than {poses.base}: its pose allows for that, and its points "
-        "do not lie on those of other LiDARs"
+        f"ranges than {poses.base}: its pose allows for that; correct its "
+        "ranges, or its points lie beside what other LiDARs see"
         for name, (longer_m, sigma_m) in poses.longer_m.items()
         if abs(longer_m) > max(_SURE * sigma_m, _LONGER_M)
     ]

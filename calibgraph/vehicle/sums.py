@@ -55,9 +55,9 @@ def residuals_m(matches: Matches) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Sums:
-    """H and g of cells by the steps of all LiDARs but the base, and what is added to ranges of all.
+    """H and g of cells, in units of residuals.
 
-    In units of residuals.
+    By the 6 steps of each LiDAR but the base, then by what is added to the ranges of each LiDAR.
 
     Attributes:
         hessian: (r, d, d), positive only in sum.
@@ -72,7 +72,7 @@ class Sums:
     @property
     def of_poses(self) -> Sums:
         """The sums with the ranges as they are."""
-        own = slice(6 * ((len(self.metric) + 6) // 7 - 1))
+        own = slice(6 * ((len(self.metric) + 6) // 7 - 1))  # of k LiDARs, d is 7 k - 6
         return Sums(self.hessian[:, own, own], self.gradient[:, own], self.metric[own, own])
 
     def basis(self) -> Array:
